@@ -166,7 +166,8 @@ def courtyard(seed: int = 4) -> list[Face]:
         wall((1.6, 7.2), (3.2, 6.5), -0.2, 1.5, framed("camera.png", black)),
     ]
     # A kiosk: three visible sides and no lid, for nobody looks down on it.
-    front, left, right = framed("rocket.jpg", black), framed("chelsea.png", white), framed("hubble_deep_field.jpg", wood)
+    front, left = framed("rocket.jpg", black), framed("chelsea.png", white)
+    right = framed("hubble_deep_field.jpg", wood)
     faces += [
         wall((-0.35, 5.2), (1.05, 5.1), 0.15, 1.2, front),
         wall((-0.25, 6.2), (-0.35, 5.2), 0.15, 1.2, left),
@@ -187,7 +188,9 @@ def cameras() -> tuple[Camera, Camera]:
     )
 
 
-def expose(image: np.ndarray, gain: Sequence[float], gamma: float, blur_px: float, noise: float, seed: int) -> np.ndarray:
+def expose(
+    image: np.ndarray, gain: Sequence[float], gamma: float, blur_px: float, noise: float, seed: int
+) -> np.ndarray:
     """What a real camera adds: white balance, tone curve, vignetting, defocus and noise of the sensor."""
     h, w = image.shape[:2]
     y, x = np.mgrid[:h, :w]
