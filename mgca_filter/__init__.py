@@ -1,0 +1,32 @@
+"""Drop-in robust matching filter for OpenCV pipelines.
+
+``filter_matches(kp1, kp2, matches)`` scores putative matches with MGCA-Net, fits the two-view geometry to the
+best of them and re-tests every match against it. Importing the package loads neither PyTorch, ONNX nor
+Matplotlib; ONNX Runtime is loaded when the first model is opened.
+"""
+
+from .correspondences import MatchAttributes
+from .errors import BackendError, BundleError, MgcaFilterError, ModelError
+from .image_matching import ImageMatchResult, match_images
+from .match_filter import MatchFilter, MatchPair, filter_many, filter_matches, model_path
+from .result import FilterResult, Status
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "BackendError",
+    "BundleError",
+    "FilterResult",
+    "ImageMatchResult",
+    "MatchAttributes",
+    "MatchFilter",
+    "MatchPair",
+    "MgcaFilterError",
+    "ModelError",
+    "Status",
+    "__version__",
+    "filter_many",
+    "filter_matches",
+    "match_images",
+    "model_path",
+]

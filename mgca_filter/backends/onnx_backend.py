@@ -1,0 +1,114 @@
+"""ONNX Runtime: the default backend."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Union
+
+from ..errors import BackendError, ModelError
+from .base import Float32Array
+from .metadata import ModelMetadata, check_model_file, parse_metadata
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+Providers = Sequence[Union[str, "tuple[str, dict[str, Any]]"]]
+
+CPU_PROVIDER = "CPUExecutionProvider"
+INPUT_NAMES = ["correspondences", "attributes"]
+OUTPUT_NAMES = ["logits", "essential"]
+# What ONNX Runtime raises for a file that is damaged or no ONNX model; anything else is the runtime's fault.
+_FILE_ERRORS = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "NoModel", "NoSuchFile", "Fail", "NotImplemented")
+_LOG_ERRORS_ONLY = 3
+
+
+class OnnxBackend:
+    """Session of ONNX Runtime over a model file of this package's contract.
+
+    Args:
+        path: the ``.onnx`` file.
+        providers: execution providers in ONNX Runtime's form; None = CPU. One that is missing or fails gives
+            way to the CPU with one warning.
+
+    Raises:
+        ModelError: the file is missing, truncated, or of another contract.
+        BackendError: ONNX Runtime is not installed or does not start.
+    """
+
+    name = "onnxruntime"
+
+    def __init__(self, path: Path, providers: Providers | None = None) -> None:
+        self._path, self._providers = path, providers
+        check_model_file(path)
+        try:
+            import onnxruntime
+        except Exception as error:  # a broken installation raises whatever its loader raises
+            raise BackendError(f"ONNX Runtime cannot be imported ({error})") from error
+        self._session = _open_session(onnxruntime, path, providers)
+        _check_names(self._session, path)
+        properties = self._session.get_modelmeta().custom_metadata_map
+        self._metadata = parse_metadata(properties, path)
+
+    @property
+    def metadata(self) -> ModelMetadata:
+        """The model file's metadata."""
+        return self._metadata
+
+    def infer(self, correspondences: Float32Array, attributes: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """One forward pass; see :class:`~mgca_filter.backends.base.Backend`."""
+        try:
+            logits, essential = self._session.run(
+                OUTPUT_NAMES, {"correspondences": correspondences, "attributes": attributes}
+            )
+        except Exception as error:  # each failure has a class of its own in ONNX Runtime
+            raise BackendError(f"ONNX Runtime failed on {self._path} ({error})") from error
+        return logits, essential
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self._path, "providers": self._providers}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        OnnxBackend.__init__(self, state["path"], state["providers"])
+
+
+def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnxruntime.InferenceSession:
+    """Open with the wanted providers, else on the CPU with one warning."""
+    options = runtime.SessionOptions()
+    options.log_severity_level = _LOG_ERRORS_ONLY
+    wanted = list(providers) if providers else [CPU_PROVIDER]
+    names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
+    missing = [name for name in names if name not in runtime.get_available_providers()]
+    usable = [provider for provider, name in zip(wanted, names) if name not in missing]
+    reason = f"this ONNX Runtime has no {', '.join(missing)}" if missing else ""
+    if usable and usable != [CPU_PROVIDER]:
+        try:
+            session = runtime.InferenceSession(str(path), options, providers=usable)
+            lost = [name for name in names if name not in missing and name not in session.get_providers()]
+            reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
+            if reason:
+                _warn_about_provider(reason)
+            return session
+        except Exception as error:
+            reason = f"{names[0]} failed ({error})"
+    if reason:
+        _warn_about_provider(reason)
+    try:
+        return runtime.InferenceSession(str(path), options, providers=[CPU_PROVIDER])
+    except Exception as error:
+        if type(error).__name__ in _FILE_ERRORS:
+            raise ModelError(f"{path}: not a readable ONNX model, truncated or damaged ({error})") from error
+        raise BackendError(f"ONNX Runtime cannot start ({error})") from error
+
+
+def _warn_about_provider(reason: str) -> None:
+    warnings.warn(f"mgca_filter runs on another provider than asked for: {reason}", RuntimeWarning, stacklevel=2)
+
+
+def _check_names(session: onnxruntime.InferenceSession, path: Path) -> None:
+    inputs, outputs = [i.name for i in session.get_inputs()], [o.name for o in session.get_outputs()]
+    if sorted(inputs) != sorted(INPUT_NAMES):
+        raise ModelError(f"{path}: inputs {inputs}, expected {INPUT_NAMES}")
+    if not set(OUTPUT_NAMES) <= set(outputs):
+        raise ModelError(f"{path}: outputs {outputs}, expected {OUTPUT_NAMES}")

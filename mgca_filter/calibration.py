@@ -1,0 +1,61 @@
+"""From logits to probabilities, and the prior that scores what never entered the network."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Abramowitz & Stegun 7.1.26: absolute error below 1.5e-7, the resolution of float32 logits.
+_ERF_P = 0.3275911
+_ERF_COEFFICIENTS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
+
+
+def sigmoid(logits: ArrayLike) -> NDArray[np.float64]:
+    """1 / (1 + exp(−x)) without overflow."""
+    x = np.asarray(logits, dtype=np.float64)
+    e = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, e) / (1.0 + e)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Platt scaling fitted on validation pairs: probability = sigmoid(scale · logit + offset)."""
+
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def probabilities(self, logits: ArrayLike) -> NDArray[np.float32]:
+        """Probability (N,) float32 that a match is an inlier, from its logit (N,)."""
+        return sigmoid(self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class AttributePrior:
+    """Logit of a match from its attributes alone: ``weight2 · gelu(weight1 a + bias1) + bias2``.
+
+    Attributes:
+        weight1: (H, 8). bias1: (H,). weight2: (H,). bias2: scalar.
+    """
+
+    weight1: NDArray[np.float64]
+    bias1: NDArray[np.float64]
+    weight2: NDArray[np.float64]
+    bias2: float
+
+    def logits(self, attributes: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Logits (N,) float32 from encoded attributes (N, 8)."""
+        hidden = gelu(attributes.astype(np.float64) @ self.weight1.T + self.bias1)
+        return (hidden @ self.weight2 + self.bias2).astype(np.float32)
+
+
+def gelu(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaussian error linear unit in its exact form, x · Φ(x)."""
+    z = np.abs(x) / np.sqrt(2.0)
+    k = 1.0 / (1.0 + _ERF_P * z)
+    polynomial = np.zeros_like(k)
+    for coefficient in _ERF_COEFFICIENTS:
+        polynomial = (polynomial + coefficient) * k
+    erf = np.sign(x) * (1.0 - polynomial * np.exp(-z * z))
+    return 0.5 * x * (1.0 + erf)

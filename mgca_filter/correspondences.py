@@ -1,0 +1,98 @@
+"""From pixels and what the matcher knew to the network's two inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+ATTRIBUTE_COUNT = 8
+CANDIDATE_MAX_RATIO = 0.95
+CANDIDATE_MIN_COUNT = 32
+
+
+@dataclass(frozen=True)
+class MatchAttributes:
+    """What a matcher knows of each match beyond its position; every field is optional, (M,) each.
+
+    Attributes:
+        ratio: distance to the nearest over distance to the second nearest descriptor, 0 … 1.
+        best: True where no other match of the list reaches the same keypoint of image 2 at a smaller
+            descriptor distance.
+        size1, size2: keypoint diameters in pixels (``cv2.KeyPoint.size``).
+        angle1, angle2: keypoint orientations in degrees (``cv2.KeyPoint.angle``, −1 = unknown).
+    """
+
+    ratio: NDArray[np.float32] | None = None
+    best: NDArray[np.bool_] | None = None
+    size1: NDArray[np.float32] | None = None
+    size2: NDArray[np.float32] | None = None
+    angle1: NDArray[np.float32] | None = None
+    angle2: NDArray[np.float32] | None = None
+
+    def encode(self, count: int) -> NDArray[np.float32]:
+        """Network input (count, 8), raw physical values; groups that are unknown are zero.
+
+        Columns: ratio, best (0/1), log2(size2 / size1), cos and sin of angle2 − angle1, and three flags
+        (0/1) — ratio known, best known, size and angle known.
+        """
+        encoded = np.zeros((count, ATTRIBUTE_COUNT), dtype=np.float32)
+        if self.ratio is not None:
+            known = np.isfinite(self.ratio)
+            encoded[:, 0] = np.clip(np.where(known, self.ratio, 0.0), 0.0, 1.0)
+            encoded[:, 5] = known
+        if self.best is not None:
+            encoded[:, 1] = self.best
+            encoded[:, 6] = 1.0
+        fields = (self.size1, self.size2, self.angle1, self.angle2)
+        if all(field is not None for field in fields):
+            size1, size2, angle1, angle2 = (np.asarray(field, dtype=np.float64) for field in fields)
+            with np.errstate(invalid="ignore"):
+                known = (size1 > 0) & (size2 > 0) & (angle1 >= 0) & (angle2 >= 0)
+                known &= np.isfinite(size1) & np.isfinite(size2) & np.isfinite(angle1) & np.isfinite(angle2)
+            turn = np.radians(np.where(known, angle2 - angle1, 0.0))
+            encoded[:, 2] = np.log2(np.where(known, size2, 1.0) / np.where(known, size1, 1.0))
+            encoded[:, 3] = np.where(known, np.cos(turn), 0.0)
+            encoded[:, 4] = np.where(known, np.sin(turn), 0.0)
+            encoded[:, 7] = known
+        return encoded
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MatchAttributes:
+        """The same attributes for a selection of matches."""
+        return MatchAttributes(
+            **{name: None if value is None else np.asarray(value)[rows] for name, value in vars(self).items()}
+        )
+
+
+def candidate_mask(
+    attributes: NDArray[np.float32],
+    max_ratio: float = CANDIDATE_MAX_RATIO,
+    min_count: int = CANDIDATE_MIN_COUNT,
+) -> NDArray[np.bool_]:
+    """Matches (M,) worth the network's time, from encoded attributes (M, 8).
+
+    A match is a candidate when it is best of the list and its ratio is below ``max_ratio``; a match whose ratio
+    or best-of-list flag is unknown is one too. All are, when fewer than ``min_count`` would remain.
+    """
+    ratio, best = attributes[:, 0], attributes[:, 1]
+    ratio_known, best_known = attributes[:, 5] > 0, attributes[:, 6] > 0
+    hopeless = ratio_known & best_known & ((ratio >= max_ratio) | (best == 0))
+    if len(hopeless) - np.count_nonzero(hopeless) < min_count:
+        return np.ones(len(attributes), dtype=bool)
+    return ~hopeless
+
+
+def normalize_points(points: ArrayLike, K: ArrayLike) -> NDArray[np.float64]:
+    """Pixels (N, 2), OpenCV's pixel centre, to the normalised image plane by K (3, 3); K may hold a skew."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    K = np.asarray(K, dtype=np.float64)
+    y = (points[:, 1] - K[1, 2]) / K[1, 1]
+    x = (points[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    return np.stack([x, y], axis=1)
+
+
+def mean_focal_length(K1: ArrayLike, K2: ArrayLike) -> float:
+    """Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane."""
+    K1, K2 = np.asarray(K1, float), np.asarray(K2, float)
+    return float((K1[0, 0] + K1[1, 1] + K2[0, 0] + K2[1, 1]) / 4.0)

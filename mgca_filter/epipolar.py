@@ -1,0 +1,124 @@
+"""Two-view geometry in numpy: the reference that labels, metrics and tests share.
+
+Conventions, everywhere in the package: ``X2 = R X1 + t`` and ``x2^T E x1 = 0`` with points
+normalised by their own intrinsics; ``correspondences`` is (N, 4) = (x1, y1, x2, y2).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def cross_matrix(t: ArrayLike) -> FloatArray:
+    """Matrix (3, 3) of the cross product with ``t`` (3,)."""
+    x, y, z = np.asarray(t, dtype=np.float64).ravel()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def essential_from_pose(R: ArrayLike, t: ArrayLike) -> FloatArray:
+    """Essential matrix (3, 3) of the relative pose ``X2 = R X1 + t``, of unit Frobenius norm."""
+    E = cross_matrix(t) @ np.asarray(R, dtype=np.float64)
+    norm = np.linalg.norm(E)
+    return E / norm if norm > 0 else E
+
+
+def fundamental_from_essential(E: ArrayLike, K1: ArrayLike, K2: ArrayLike) -> FloatArray:
+    """F (3, 3) for pixels, of unit Frobenius norm, from E and the intrinsics of both images."""
+    F = np.linalg.inv(np.asarray(K2, float)).T @ np.asarray(E, float) @ np.linalg.inv(np.asarray(K1, float))
+    return F / np.linalg.norm(F)
+
+
+def homogeneous(points: ArrayLike) -> FloatArray:
+    """Append a column of ones to points (N, 2)."""
+    p = np.asarray(points, dtype=np.float64)
+    return np.concatenate([p, np.ones((len(p), 1))], axis=1)
+
+
+def _epipolar_terms(correspondences: ArrayLike, E: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Algebraic error (N,) and the squared norms (N,) of the epipolar line normals in image 2 and 1."""
+    c = np.asarray(correspondences, dtype=np.float64)
+    x1, x2 = homogeneous(c[:, :2]), homogeneous(c[:, 2:4])
+    E = np.asarray(E, dtype=np.float64)
+    line2, line1 = x1 @ E.T, x2 @ E
+    error = np.sum(x2 * line2, axis=1)
+    return error, np.sum(line2[:, :2] ** 2, axis=1), np.sum(line1[:, :2] ** 2, axis=1)
+
+
+def symmetric_epipolar_distance_squared(correspondences: ArrayLike, E: ArrayLike) -> FloatArray:
+    """Squared distances to both epipolar lines, summed, (N,); the field's label at 1e-4.
+
+    (x2^T E x1)^2 (1 / |E x1|^2_12 + 1 / |E^T x2|^2_12), in the squared unit of the coordinates.
+    Works for F and pixels as well.
+    """
+    error, n2, n1 = _epipolar_terms(correspondences, E)
+    tiny = np.finfo(np.float64).tiny
+    return error**2 * (1.0 / np.maximum(n2, tiny) + 1.0 / np.maximum(n1, tiny))
+
+
+def sampson_distance(correspondences: ArrayLike, E: ArrayLike) -> FloatArray:
+    """First-order distance (N,) to the epipolar geometry, in the unit of the coordinates.
+
+    |x2^T E x1| / sqrt(|E x1|^2_12 + |E^T x2|^2_12) (Hartley & Zisserman, 2nd ed., eq. 11.9).
+    Works for F and pixels as well.
+    """
+    error, n2, n1 = _epipolar_terms(correspondences, E)
+    return np.abs(error) / np.sqrt(np.maximum(n2 + n1, np.finfo(np.float64).tiny))
+
+
+def project_to_essential(M: ArrayLike) -> FloatArray:
+    """Closest matrix with singular values (s, s, 0), scaled to unit Frobenius norm."""
+    U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
+    return U @ np.diag([1.0, 1.0, 0.0]) @ Vt / np.sqrt(2.0)
+
+
+def decompose_essential(E: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
+    """The four poses (R, t) of an essential matrix; t has unit norm (Hartley & Zisserman 9.6.2)."""
+    U, _, Vt = np.linalg.svd(np.asarray(E, dtype=np.float64))
+    U = U * np.sign(np.linalg.det(U))
+    Vt = Vt * np.sign(np.linalg.det(Vt))
+    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    R_a, R_b, t = U @ W @ Vt, U @ W.T @ Vt, U[:, 2]
+    return [(R_a, t), (R_a, -t), (R_b, t), (R_b, -t)]
+
+
+def triangulated_depths(correspondences: ArrayLike, R: ArrayLike, t: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Depths (N,), (N,) in camera 1 and 2 of the points closest to both viewing rays.
+
+    Least squares of ``d2 x2 = d1 R x1 + t`` (mid-point of the rays), in the unit of ``t``. Rays that
+    are parallel to the accuracy of float64 give infinite depths.
+    """
+    c = np.asarray(correspondences, dtype=np.float64)
+    t = np.asarray(t, dtype=np.float64).ravel()
+    a = homogeneous(c[:, :2]) @ np.asarray(R, dtype=np.float64).T
+    b = homogeneous(c[:, 2:4])
+    aa, bb, ab = np.sum(a * a, axis=1), np.sum(b * b, axis=1), np.sum(a * b, axis=1)
+    at, bt = a @ t, b @ t
+    det = aa * bb - ab**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth1 = (ab * bt - bb * at) / det
+        depth2 = (aa * bt - ab * at) / det
+    parallel = det <= 1e-15 * aa * bb
+    return np.where(parallel, np.inf, depth1), np.where(parallel, np.inf, depth2)
+
+
+def rotation_error_deg(R_estimated: ArrayLike, R_true: ArrayLike) -> float:
+    """Geodesic angle between two rotations, degrees, 0 … 180."""
+    cosine = (np.trace(np.asarray(R_estimated, float).T @ np.asarray(R_true, float)) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
+
+
+def translation_error_deg(t_estimated: ArrayLike, t_true: ArrayLike) -> float:
+    """Angle between two translation directions with the sign ignored, degrees, 0 … 90."""
+    a, b = np.ravel(np.asarray(t_estimated, float)), np.ravel(np.asarray(t_true, float))
+    norm = np.linalg.norm(a) * np.linalg.norm(b)
+    if norm == 0:
+        return 90.0
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(float(a @ b)))))
+
+
+def pose_error_deg(R_estimated: ArrayLike, t_estimated: ArrayLike, R_true: ArrayLike, t_true: ArrayLike) -> float:
+    """Larger of rotation and translation error, degrees: the pose error of the field's protocol."""
+    return max(rotation_error_deg(R_estimated, R_true), translation_error_deg(t_estimated, t_true))

@@ -1,0 +1,19 @@
+"""Exceptions of the package: misuse and broken model files raise, data never does."""
+
+from __future__ import annotations
+
+
+class MgcaFilterError(Exception):
+    """Base class of the errors that are the package's own."""
+
+
+class ModelError(MgcaFilterError):
+    """A model file is missing, truncated or of another contract; the message names the file."""
+
+
+class BackendError(MgcaFilterError):
+    """An inference backend could not be started or refused its input."""
+
+
+class BundleError(MgcaFilterError, ValueError):
+    """A scene bundle lacks a field or holds values that cannot be; the message names file and field."""

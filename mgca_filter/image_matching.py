@@ -1,0 +1,70 @@
+"""From two images to filtered matches: detect, match nearest neighbours, filter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .keypoints import SIFT_FEATURE_COUNT, create_detector, detect_keypoints
+from .match_filter import filter_matches
+from .matching import match_descriptors
+from .result import FilterResult
+
+
+@dataclass(frozen=True)
+class ImageMatchResult:
+    """Answer of :func:`match_images`.
+
+    Attributes:
+        keypoints1, keypoints2: all keypoints, in pixels of the images that came in.
+        matches: the putative matches, ``knnMatch`` rows of up to two candidates, best first; the rows of
+            ``result.mask``.
+        result: the filter's answer; ``result.matches`` are the kept rows.
+    """
+
+    keypoints1: list[cv2.KeyPoint]
+    keypoints2: list[cv2.KeyPoint]
+    matches: tuple[tuple[cv2.DMatch, ...], ...]
+    result: FilterResult
+
+
+def match_images(
+    image1: NDArray[Any],
+    image2: NDArray[Any],
+    *,
+    detector: str | cv2.Feature2D = "sift",
+    max_keypoints: int = SIFT_FEATURE_COUNT,
+    **options: Any,
+) -> ImageMatchResult:
+    """Detect, match and filter two images, with the settings that the training data used.
+
+    Keypoints come from a grey copy of at most 1200 px on its longer side and are given back in pixels of the
+    original.
+
+    Args:
+        image1, image2: uint8 (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA.
+        detector: ``"sift"``, ``"orb"``, ``"akaze"``, or any ``cv2.Feature2D`` that describes.
+        max_keypoints: per image, for a detector given by name.
+        options: keyword options of :func:`mgca_filter.filter_matches`; ``size1`` and ``size2`` are the images'
+            own unless given.
+
+    Raises:
+        TypeError, ValueError: an argument or option is of another type, shape or range.
+        ModelError, BackendError, ImportError: as :func:`mgca_filter.filter_matches`.
+    """
+    if isinstance(detector, str):
+        detector = create_detector(detector, max_keypoints)
+    elif not isinstance(detector, cv2.Feature2D):
+        raise TypeError(f"detector: expected a name or a cv2.Feature2D, got {type(detector).__name__}")
+    keypoints1, descriptors1 = detect_keypoints(image1, detector, "image1")
+    keypoints2, descriptors2 = detect_keypoints(image2, detector, "image2")
+    matches = match_descriptors(descriptors1, descriptors2, detector.defaultNorm())
+    for name, image in (("size1", image1), ("size2", image2)):
+        if options.get(name) is None:
+            options[name] = np.array([image.shape[1], image.shape[0]])
+    result = filter_matches(keypoints1, keypoints2, matches, **options)
+    return ImageMatchResult(keypoints1, keypoints2, matches, result)

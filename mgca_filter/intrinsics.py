@@ -1,0 +1,139 @@
+"""Intrinsics: checked where the caller gave them, guessed where not; pixels to the normalised plane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .correspondences import normalize_points
+
+GUESSED_FOCAL_FACTOR = 1.2
+_DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Camera of one image.
+
+    Attributes:
+        K: (3, 3) float64, pixels.
+        distortion: OpenCV coefficients (4, 5, 8, 12 or 14), or None.
+        guessed: the focal length is a guess, not the caller's.
+        assumption: one sentence about what was assumed, or None.
+    """
+
+    K: NDArray[np.float64]
+    distortion: NDArray[np.float64] | None
+    guessed: bool
+    assumption: str | None = None
+
+    def normalize(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels (N, 2) to the normalised image plane (N, 2), distortion removed; NaN where that fails."""
+        normalized = np.full(points.shape, np.nan)
+        finite = np.isfinite(points).all(axis=1)
+        if self.distortion is None:
+            normalized[finite] = normalize_points(points[finite], self.K)
+        elif finite.any():
+            undistorted = cv2.undistortPoints(
+                np.ascontiguousarray(points[finite])[:, None], self.K, self.distortion
+            )
+            normalized[finite] = undistorted[:, 0]
+        return normalized
+
+    def project(self, normalized: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Normalised points (N, 2) to pixels (N, 2) free of distortion."""
+        x, y = normalized[:, 0], normalized[:, 1]
+        K = self.K
+        return np.stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]], axis=1)
+
+
+def resolve_intrinsics(
+    points1: NDArray[np.float64],
+    points2: NDArray[np.float64],
+    *,
+    K1: Any = None,
+    K2: Any = None,
+    dist1: Any = None,
+    dist2: Any = None,
+    size1: Any = None,
+    size2: Any = None,
+) -> tuple[Intrinsics, Intrinsics]:
+    """Intrinsics of both images from the options of the filter.
+
+    Args:
+        points1, points2: all keypoints (N, 2) of the images, pixels; their extent stands in for a missing size.
+        K1, K2: (3, 3) or None; ``K1`` alone means that both images share it (and ``dist1``).
+        dist1, dist2: OpenCV distortion coefficients, or None.
+        size1, size2: (width, height) in pixels, or None; only a guess needs them.
+
+    Raises:
+        TypeError, ValueError: an option is of another type, shape or range, or one is missing that another needs.
+    """
+    if K1 is None and K2 is not None:
+        raise ValueError("K1: expected a (3, 3) matrix, because K2 was given")
+    for name, dist, needed, K in (("dist1", dist1, "K1", K1), ("dist2", dist2, "K1", K1)):
+        if dist is not None and K is None:
+            raise ValueError(f"{name}: distortion coefficients need {needed}")
+    sizes = (_read_size(size1, "size1"), _read_size(size2, "size2"))
+    if K1 is None:
+        return _guess(points1, sizes[0], 1), _guess(points2, sizes[1], 2)
+    first = Intrinsics(_read_K(K1, "K1"), _read_distortion(dist1, "dist1"), guessed=False)
+    if K2 is None:
+        distortion2 = first.distortion if dist2 is None else _read_distortion(dist2, "dist2")
+        return first, Intrinsics(first.K, distortion2, False, "both images share K1")
+    return first, Intrinsics(_read_K(K2, "K2"), _read_distortion(dist2, "dist2"), guessed=False)
+
+
+def _guess(points: NDArray[np.float64], size: tuple[float, float] | None, image: int) -> Intrinsics:
+    source = "the image size"
+    if size is None:
+        finite = points[np.isfinite(points).all(axis=1)]
+        width, height = (np.max(finite, axis=0) + 1.0) if len(finite) else (1.0, 1.0)
+        size = (max(float(width), 1.0), max(float(height), 1.0))
+        source = "the extent of the keypoints"
+    focal = GUESSED_FOCAL_FACTOR * max(size)
+    K = np.array([[focal, 0.0, (size[0] - 1.0) / 2.0], [0.0, focal, (size[1] - 1.0) / 2.0], [0.0, 0.0, 1.0]])
+    return Intrinsics(K, None, True, f"focal length {focal:.0f} px of image {image} guessed from {source}")
+
+
+def _read_numbers(value: Any, name: str, expected: str) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name}: expected {expected} ({error})") from error
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"{name}: expected {expected}, got dtype {array.dtype}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: expected {expected}, got NaN or infinite values")
+    return array.astype(np.float64)
+
+
+def _read_K(value: Any, name: str) -> NDArray[np.float64]:
+    K = _read_numbers(value, name, "a (3, 3) matrix of real numbers")
+    if K.shape != (3, 3):
+        raise ValueError(f"{name}: expected shape (3, 3), got {K.shape}")
+    if not np.allclose(K[2], [0.0, 0.0, 1.0]) or K[1, 0] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise ValueError(f"{name}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx, fy, got {K.tolist()}")
+    return K
+
+
+def _read_distortion(value: Any, name: str) -> NDArray[np.float64] | None:
+    if value is None:
+        return None
+    coefficients = _read_numbers(value, name, "distortion coefficients").ravel()
+    if len(coefficients) not in _DISTORTION_LENGTHS:
+        raise ValueError(f"{name}: expected 4, 5, 8, 12 or 14 coefficients, got {len(coefficients)}")
+    return coefficients if np.any(coefficients) else None
+
+
+def _read_size(value: Any, name: str) -> tuple[float, float] | None:
+    if value is None:
+        return None
+    size = _read_numbers(value, name, "(width, height) in pixels")
+    if size.shape != (2,) or (size < 1).any():
+        raise ValueError(f"{name}: expected (width, height) of at least one pixel each, got {np.shape(value)} {value!r}")
+    return float(size[0]), float(size[1])

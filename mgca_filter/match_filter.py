@@ -1,0 +1,355 @@
+"""The public door: ``filter_matches`` and ``MatchFilter``; the flow of one pair, one call per step, in order."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .backends import BACKENDS, Backend, Providers, open_backend
+from .correspondences import MatchAttributes
+from .pair_input import PairInput, prepare_pair
+from .result import FilterResult, Status
+from .robust_fit import METHODS, MIN_MATCHES, RobustFitOptions, estimate_model, match_order
+from .scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_for_fit, select_network_input
+from .verdict import Verdict, count_distinct, judge
+
+# With fewer accepted matches than this, the best-scored ones fill up what the robust fit sees.
+MIN_FIT_MATCHES = 32
+_BATCH_PAIRS = 8
+
+_open_backends: dict[tuple[Any, ...], Backend] = {}
+_open_lock = threading.Lock()
+
+
+def model_path() -> Path:
+    """Where the ONNX file of the shipped model lies."""
+    return Path(__file__).resolve().parent / "models" / "mgca_small.onnx"
+
+
+@dataclass(frozen=True)
+class MatchPair:
+    """Arguments of one pair for :func:`filter_many`; fields as in :func:`filter_matches`."""
+
+    kp1: Any
+    kp2: Any
+    matches: Any
+    K1: Any = None
+    K2: Any = None
+    dist1: Any = None
+    dist2: Any = None
+    size1: Any = None
+    size2: Any = None
+    attributes: MatchAttributes | None = None
+
+
+class MatchFilter:
+    """The filter as an object that keeps its session, for loops and threads.
+
+    Thread-safe; picklable, with the session reopened on the other side.
+
+    Args:
+        threshold: inlier threshold of the mask, pixels (Sampson distance).
+        confidence: of the robust fit, between 0 and 1.
+        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"``, ``"poselib"`` (needs that package) or
+            ``"none"``, which returns scores and a mask of scores above 0.5, no geometry.
+        model: path of a model file; None = the shipped model.
+        providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
+        backend: ``"auto"``, ``"onnxruntime"`` or ``"torch"``.
+        seed: of every random choice.
+
+    Raises:
+        TypeError, ValueError: an option is not one of the above.
+        ModelError: the model file is missing, truncated or of another contract.
+        BackendError: no runtime can be started.
+        ImportError: ``method="poselib"`` without PoseLib.
+    """
+
+    def __init__(
+        self,
+        *,
+        threshold: float = 1.0,
+        confidence: float = 0.999,
+        method: str = "prosac",
+        model: str | Path | None = None,
+        providers: Providers | None = None,
+        backend: str = "auto",
+        seed: int = 0,
+    ) -> None:
+        _check_choice(method, METHODS, "method")
+        _check_choice(backend, BACKENDS, "backend")
+        self.threshold = _check_number(threshold, "threshold", 0.0, float("inf"))
+        self.method = method
+        self.fit_options = RobustFitOptions(
+            method=method, confidence=_check_number(confidence, "confidence", 0.0, 1.0), seed=_check_seed(seed)
+        )
+        self._backend = _shared_backend(_check_path(model), backend, _check_providers(providers))
+
+    def filter(
+        self,
+        kp1: Any,
+        kp2: Any,
+        matches: Any,
+        *,
+        K1: Any = None,
+        K2: Any = None,
+        dist1: Any = None,
+        dist2: Any = None,
+        size1: Any = None,
+        size2: Any = None,
+        attributes: MatchAttributes | None = None,
+    ) -> FilterResult:
+        """Filter the matches of one pair; arguments, result and errors as in :func:`filter_matches`."""
+        return self.filter_many([MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)])[0]
+
+    def filter_many(self, pairs: Iterable[MatchPair | tuple[Any, Any, Any]]) -> list[FilterResult]:
+        """Filter many pairs; those that send equally many matches go through the network in one batch.
+
+        Args:
+            pairs: :class:`MatchPair` objects or tuples ``(kp1, kp2, matches)``.
+
+        Returns:
+            One result per pair, in their order; equal to single calls up to the rounding of the batched network.
+
+        Raises:
+            As :func:`filter_matches`.
+        """
+        jobs = [self._start(pair, index) for index, pair in enumerate(pairs)]
+        by_count: dict[int, list[_Job]] = {}
+        for job in jobs:
+            by_count.setdefault(len(job.sent.rows), []).append(job)
+        for count, group in by_count.items():
+            for first in range(0, len(group) if count else 0, _BATCH_PAIRS):
+                self._run_batch(group[first : first + _BATCH_PAIRS])
+        return [self._finish(job) for job in jobs]
+
+    def _start(self, pair: MatchPair | tuple[Any, Any, Any], index: int) -> _Job:
+        """Steps 1 and 2: read the pair; choose what enters the network."""
+        started = time.perf_counter()
+        if isinstance(pair, tuple) and len(pair) == 3:
+            pair = MatchPair(*pair)
+        if not isinstance(pair, MatchPair):
+            raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
+        prepared = prepare_pair(**{f.name: getattr(pair, f.name) for f in fields(pair)})
+        sent = select_network_input(
+            prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.fit_options.seed
+        )
+        return _Job(prepared, sent, timings_ms={"prepare": _milliseconds_since(started)})
+
+    def _run_batch(self, jobs: list[_Job]) -> None:
+        """Step 3: one forward pass."""
+        started = time.perf_counter()
+        outputs = run_network(self._backend, [job.sent for job in jobs])
+        elapsed = _milliseconds_since(started) / len(jobs)
+        for job, output in zip(jobs, outputs):
+            job.output = output
+            job.timings_ms["network"] = elapsed
+
+    def _finish(self, job: _Job) -> FilterResult:
+        """Steps 4 to 7: scores, robust fit on the best of them, re-test of all matches, verdict."""
+        pair, metadata = job.pair, self._backend.metadata
+        logits = assemble_logits(pair.attributes, pair.valid, job.sent, job.output, self._backend)
+        scores = np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
+        started = time.perf_counter()
+        if self.method == "none":
+            verdict = _verdict_by_scores(pair, scores)
+        else:
+            rows = select_for_fit(logits, job.sent, metadata.decision_threshold, MIN_FIT_MATCHES)
+            known = pair.attributes[rows, 5] > 0
+            order = rows[match_order(scores[rows], pair.attributes[rows, 0], known)]
+            model = estimate_model(
+                pair.correspondences, order, pair.focal_px, self.fit_options, calibrated=pair.calibrated
+            )
+            job.timings_ms["fit"] = _milliseconds_since(started)
+            started = time.perf_counter()
+            verdict = judge(pair, model, order, self.threshold, self.fit_options)
+        job.timings_ms["verdict"] = _milliseconds_since(started)
+        return FilterResult(
+            mask=verdict.mask,
+            scores=scores,
+            matches=pair.matches.select(verdict.mask),
+            E=verdict.E,
+            F=verdict.F,
+            R=verdict.R,
+            t=verdict.t,
+            status=verdict.status,
+            num_inliers=int(np.count_nonzero(verdict.mask)),
+            info={**self._describe(job), "logits": logits, **verdict.info},
+        )
+
+    def _describe(self, job: _Job) -> dict[str, Any]:
+        cameras = (job.pair.intrinsics1, job.pair.intrinsics2)
+        job.timings_ms["total"] = sum(job.timings_ms.values())
+        return {
+            "timings_ms": job.timings_ms,
+            "backend": self._backend.name,
+            "model": self._backend.metadata.name,
+            "model_sha256": self._backend.metadata.sha256,
+            "intrinsics": "given" if job.pair.calibrated else "guessed",
+            "assumptions": [camera.assumption for camera in cameras if camera.assumption],
+            "num_network_matches": len(job.sent.rows),
+            "network_essential": None if job.output is None else job.output.essential,
+        }
+
+
+@dataclass
+class _Job:
+    """One pair on its way through the steps."""
+
+    pair: PairInput
+    sent: NetworkInput
+    timings_ms: dict[str, float]
+    output: NetworkOutput | None = None
+
+
+def filter_matches(
+    kp1: Any,
+    kp2: Any,
+    matches: Any,
+    *,
+    K1: Any = None,
+    K2: Any = None,
+    dist1: Any = None,
+    dist2: Any = None,
+    size1: Any = None,
+    size2: Any = None,
+    threshold: float = 1.0,
+    confidence: float = 0.999,
+    method: str = "prosac",
+    attributes: MatchAttributes | None = None,
+    model: str | Path | None = None,
+    providers: Providers | None = None,
+    backend: str = "auto",
+    seed: int = 0,
+) -> FilterResult:
+    """Tell right matches from wrong ones and estimate the two-view geometry.
+
+    Pixels follow OpenCV (the centre of the top-left pixel is (0, 0)); ``x2^T E x1 = 0``, ``X2 = R X1 + t``.
+
+    Args:
+        kp1, kp2: sequences of ``cv2.KeyPoint``, or arrays (N, 2) or (N, 1, 2) of pixels.
+        matches: sequence of ``cv2.DMatch``; ``knnMatch`` output, whose second candidates give the ratio; an
+            integer array (M, 2); or None = row i matches row i. What matches and keypoints know beyond
+            position (ratio, best of the list, size, angle) is used and never required.
+        K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal length is
+            guessed and F is the model to trust.
+        dist1, dist2: OpenCV distortion coefficients; E and F then hold for undistorted points.
+        size1, size2: (width, height), pixels; they help the guess of missing intrinsics.
+        threshold: inlier threshold of the mask, pixels (Sampson distance); the fit has its own.
+        confidence: of the robust fit, between 0 and 1.
+        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"``, ``"poselib"`` (needs that package) or
+            ``"none"``, which returns scores and a mask of scores above 0.5, no geometry.
+        attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
+        model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
+        providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
+        backend: ``"auto"``, ``"onnxruntime"`` or ``"torch"``.
+        seed: of every random choice; same seed, input and machine give the same bits.
+
+    Returns:
+        Mask, scores, kept matches, E, F, R, t and a status. Data never raises: where there is no geometry the
+        status says why, the mask is all False and the matrices are None.
+
+    Raises:
+        TypeError, ValueError: an argument is of another type, shape, length or range; the message names it.
+        ModelError: the model file is missing, truncated or of another contract.
+        BackendError: no runtime can be started, or it refused.
+        ImportError: ``method="poselib"`` without PoseLib.
+    """
+    match_filter = MatchFilter(
+        threshold=threshold,
+        confidence=confidence,
+        method=method,
+        model=model,
+        providers=providers,
+        backend=backend,
+        seed=seed,
+    )
+    return match_filter.filter(
+        kp1,
+        kp2,
+        matches,
+        K1=K1,
+        K2=K2,
+        dist1=dist1,
+        dist2=dist2,
+        size1=size1,
+        size2=size2,
+        attributes=attributes,
+    )
+
+
+def filter_many(pairs: Iterable[MatchPair | tuple[Any, Any, Any]], **options: Any) -> list[FilterResult]:
+    """Filter many pairs with the options of :class:`MatchFilter`; see :meth:`MatchFilter.filter_many`."""
+    return MatchFilter(**options).filter_many(pairs)
+
+
+def _verdict_by_scores(pair: PairInput, scores: NDArray[np.float32]) -> Verdict:
+    """Answer without a robust fit: the mask is the network's opinion, and there is no geometry to judge."""
+    too_few = count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES
+    mask = (scores > 0.5) & pair.valid & (not too_few)
+    if too_few:
+        return Verdict(Status.TOO_FEW_MATCHES, mask)
+    return Verdict(Status.OK if np.count_nonzero(mask) >= MIN_MATCHES else Status.LOW_SUPPORT, mask)
+
+
+def _milliseconds_since(started: float) -> float:
+    return 1000.0 * (time.perf_counter() - started)
+
+
+def _shared_backend(path: Path, backend: str, providers: Providers | None) -> Backend:
+    """The open backend of a model file, opened once per process and again when the file changes."""
+    path = path.resolve()
+    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
+    key = (path, stamp, backend, repr(providers))
+    with _open_lock:
+        if key not in _open_backends:
+            _open_backends[key] = open_backend(path, backend, providers)
+        return _open_backends[key]
+
+
+def _check_choice(value: Any, choices: tuple[str, ...], name: str) -> None:
+    if not isinstance(value, str):
+        raise TypeError(f"{name}: expected one of {', '.join(choices)}, got {type(value).__name__}")
+    if value not in choices:
+        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+def _check_number(value: Any, name: str, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
+        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
+    if not low < value < high:
+        raise ValueError(f"{name}: expected a number above {low:g} and below {high:g}, got {value}")
+    return float(value)
+
+
+def _check_seed(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+        raise TypeError(f"seed: expected an integer, got {type(value).__name__}")
+    if value < 0:
+        raise ValueError(f"seed: expected 0 or more, got {value}")
+    return int(value)
+
+
+def _check_path(value: Any) -> Path:
+    if value is None:
+        return model_path()
+    if not isinstance(value, (str, Path)):
+        raise TypeError(f"model: expected a path, got {type(value).__name__}")
+    return Path(value)
+
+
+def _check_providers(value: Any) -> Providers | None:
+    if value is None:
+        return None
+    if isinstance(value, str) or not isinstance(value, (list, tuple)):
+        raise TypeError(f"providers: expected a list of provider names, got {type(value).__name__}")
+    for item in value:
+        if not (isinstance(item, str) or (isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str))):
+            raise TypeError(f"providers: expected names or (name, options), got {item!r}")
+    return value

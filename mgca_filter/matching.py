@@ -1,0 +1,186 @@
+"""Matches in and out: ``cv2.DMatch``, ``knnMatch`` output, index arrays; and nearest-neighbour matching."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# OpenCV's default of DMatch.distance is the largest float: "no distance was set".
+_NO_DISTANCE = 1e38
+
+
+@dataclass(frozen=True)
+class PutativeMatches:
+    """Matches read from the caller's type; M rows in the order of the input.
+
+    Attributes:
+        index1, index2: (M,) rows of the keypoints; −1 in both where the caller's row holds no match at all
+            (``knnMatch`` writes such rows).
+        ratio: (M,) float32 ratio of the two best distances, NaN where a row has no second candidate, or None.
+        best: (M,) bool, no other row reaches the same keypoint of image 2 at a smaller distance, or None.
+        source: what the caller passed, for :meth:`select`.
+    """
+
+    index1: NDArray[np.intp]
+    index2: NDArray[np.intp]
+    ratio: NDArray[np.float32] | None
+    best: NDArray[np.bool_] | None
+    source: Any
+
+    def __len__(self) -> int:
+        return len(self.index1)
+
+    def select(self, mask: NDArray[np.bool_]) -> Any:
+        """The rows where ``mask`` (M,) is True, in the caller's type.
+
+        A tuple stays a tuple, any other sequence becomes a list, an array stays an array of its dtype, and
+        ``None`` (row i matches row i) becomes index pairs (K, 2).
+        """
+        if self.source is None:
+            return np.stack([self.index1[mask], self.index2[mask]], axis=1)
+        if isinstance(self.source, np.ndarray):
+            return self.source.reshape(-1, 2)[mask]
+        kept = [self.source[i] for i in np.flatnonzero(mask)]
+        return tuple(kept) if isinstance(self.source, tuple) else kept
+
+
+def read_matches(matches: Any, count1: int, count2: int, name: str = "matches") -> PutativeMatches:
+    """Read matches between ``count1`` and ``count2`` keypoints.
+
+    Args:
+        matches: sequence of ``cv2.DMatch``; ``knnMatch`` output (a sequence of sequences: the first candidate
+            is the match, the second gives the ratio); an integer array (M, 2); or None = row i matches row i.
+        name: name of the argument, for messages.
+
+    Raises:
+        TypeError: another type. ValueError: another shape, an index out of range, or None for keypoint lists
+            of different length.
+    """
+    if matches is None:
+        if count1 != count2:
+            raise ValueError(f"{name}: None means that row i matches row i, but there are {count1} and {count2} keypoints")
+        rows = np.arange(count1, dtype=np.intp)
+        return PutativeMatches(rows, rows, None, None, None)
+    if isinstance(matches, (str, bytes, dict, cv2.DMatch)):
+        raise TypeError(f"{name}: expected DMatch, knnMatch output, an array (M, 2) or None, got {type(matches).__name__}")
+    if not isinstance(matches, np.ndarray) and isinstance(matches, Sequence):
+        if len(matches) == 0:
+            none = np.zeros(0, dtype=np.intp)
+            return PutativeMatches(none, none, None, None, matches)
+        if isinstance(matches[0], cv2.DMatch):
+            return _from_dmatch(matches, [(m,) for m in matches], count1, count2, name)
+        if any(_is_knn_row(row) for row in matches):
+            return _from_dmatch(matches, matches, count1, count2, name)
+    return _from_array(matches, count1, count2, name)
+
+
+def _is_knn_row(row: Any) -> bool:
+    return isinstance(row, (list, tuple)) and (len(row) == 0 or isinstance(row[0], cv2.DMatch))
+
+
+def _from_dmatch(source: Any, rows: Sequence[Any], count1: int, count2: int, name: str) -> PutativeMatches:
+    """Matches from rows of candidates, best first; a row may be empty."""
+    count = len(rows)
+    index1, index2 = np.full(count, -1, dtype=np.intp), np.full(count, -1, dtype=np.intp)
+    distance1, distance2 = np.full(count, np.nan), np.full(count, np.nan)
+    for i, row in enumerate(rows):
+        if not isinstance(row, Sequence) or not all(isinstance(m, cv2.DMatch) for m in row):
+            raise TypeError(f"{name}[{i}]: expected cv2.DMatch like its neighbours, got {_describe(row)}")
+        if len(row) > 0:
+            index1[i], index2[i], distance1[i] = row[0].queryIdx, row[0].trainIdx, row[0].distance
+        if len(row) > 1:
+            distance2[i] = row[1].distance
+    present = np.array([len(row) > 0 for row in rows])
+    _check_range(index1[present], index2[present], count1, count2, name)
+    distance1, distance2 = (np.where(np.abs(d) < _NO_DISTANCE, d, np.nan) for d in (distance1, distance2))
+    ratio = None if np.isnan(distance2).all() else distance_ratio(distance1, distance2)
+    return PutativeMatches(index1, index2, ratio, best_of_list(index2, distance1), source)
+
+
+def _describe(row: Any) -> str:
+    item = row[0] if isinstance(row, (list, tuple)) and len(row) else row
+    return type(item).__name__
+
+
+def _from_array(matches: Any, count1: int, count2: int, name: str) -> PutativeMatches:
+    try:
+        array = np.asarray(matches)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{name}: expected an array (M, 2) of indices ({error})") from error
+    if array.size == 0 and array.shape in ((0,), (0, 2)):
+        array = np.zeros((0, 2), dtype=array.dtype if array.dtype.kind in "iu" else np.intp)
+    if array.dtype.kind not in "iu":
+        raise TypeError(f"{name}: expected DMatch or an integer array (M, 2), got dtype {array.dtype}")
+    if array.ndim != 2 or array.shape[1] != 2:
+        raise ValueError(f"{name}: expected shape (M, 2), got {array.shape}")
+    if array.size and array.max() > np.iinfo(np.intp).max:  # uint64 would wrap around
+        raise ValueError(f"{name}: index {array.max()} is out of range")
+    index1, index2 = array[:, 0].astype(np.intp), array[:, 1].astype(np.intp)
+    _check_range(index1, index2, count1, count2, name)
+    return PutativeMatches(index1, index2, None, None, array)
+
+
+def _check_range(
+    index1: NDArray[np.intp], index2: NDArray[np.intp], count1: int, count2: int, name: str
+) -> None:
+    for index, count, image in ((index1, count1, 1), (index2, count2, 2)):
+        wrong = (index < 0) | (index >= count)
+        if wrong.any():
+            raise ValueError(f"{name}: index {index[wrong][0]} is out of range for the {count} keypoints of image {image}")
+
+
+def distance_ratio(nearest: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Ratio (M,) of nearest to second nearest descriptor distance, 0 … 1; NaN where one is NaN.
+
+    Two candidates at distance zero cannot be told apart: their ratio is 1.
+    """
+    known = np.isfinite(nearest) & np.isfinite(second)
+    ambiguous = known & (second <= 0)
+    ratio = np.divide(nearest, second, out=np.full(len(nearest), np.nan), where=known & ~ambiguous)
+    return np.where(ambiguous, 1.0, np.clip(ratio, 0.0, 1.0)).astype(np.float32)
+
+
+def best_of_list(index2: NDArray[np.intp], distance: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    """True (M,) where no other match reaches the same keypoint of image 2 at a smaller distance.
+
+    Returns None where the distances say nothing: some are missing, or several matches all have the same.
+    """
+    present = index2 >= 0
+    known = distance[present]
+    if not present.any() or not np.isfinite(known).all() or (len(known) > 1 and np.ptp(known) == 0):
+        return None
+    smallest = np.full(int(index2.max()) + 1, np.inf)
+    np.minimum.at(smallest, index2[present], known)
+    best = np.zeros(len(index2), dtype=bool)
+    best[present] = known <= smallest[index2[present]]
+    return best
+
+
+def match_descriptors(
+    descriptors1: NDArray[Any], descriptors2: NDArray[Any], norm: int | None = None
+) -> tuple[tuple[cv2.DMatch, ...], ...]:
+    """Two nearest neighbours in image 2 of every descriptor of image 1, as ``knnMatch`` returns them.
+
+    Args:
+        descriptors1, descriptors2: (N, D), of the same dtype. Without descriptors on either side there are no
+            matches.
+        norm: ``cv2.NORM_*``; None = Hamming distance for uint8, Euclidean distance for all others.
+
+    Raises:
+        ValueError: the two descriptor arrays differ in dtype or length D.
+    """
+    if len(descriptors1) == 0 or len(descriptors2) == 0:
+        return ()
+    if descriptors1.dtype != descriptors2.dtype or descriptors1.shape[1:] != descriptors2.shape[1:]:
+        raise ValueError(
+            f"descriptors2: expected {descriptors1.dtype} of length {descriptors1.shape[1:]} like descriptors1, "
+            f"got {descriptors2.dtype} of length {descriptors2.shape[1:]}"
+        )
+    if norm is None:
+        norm = cv2.NORM_HAMMING if descriptors1.dtype == np.uint8 else cv2.NORM_L2
+    return tuple(tuple(row) for row in cv2.BFMatcher(norm).knnMatch(descriptors1, descriptors2, k=2))

@@ -1,0 +1,131 @@
+"""From the fitted model to the answer: mask, matrices and status of a pair."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import degeneracy
+from .epipolar import fundamental_from_essential, sampson_distance
+from .pair_input import PairInput
+from .result import Status
+from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model, fit_homography
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Status of a pair and what is left of its model; fields as in :class:`mgca_filter.FilterResult`."""
+
+    status: Status
+    mask: NDArray[np.bool_]
+    E: Array | None = None
+    F: Array | None = None
+    R: Array | None = None
+    t: Array | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+
+
+def judge(
+    pair: PairInput, model: TwoViewModel | None, order: NDArray[np.intp], mask_threshold_px: float, options: RobustFitOptions
+) -> Verdict:
+    """Re-test all matches against the model and decide what it is worth.
+
+    Args:
+        pair: the pair, M matches.
+        model: the fitted model, or None.
+        order: (K,) rows that it was fitted to, best first.
+        mask_threshold_px: Sampson distance below which a match is kept, pixels.
+        options: of the robust fit; the rules below measure at its ``refine_threshold_px``.
+    """
+    nothing = np.zeros(len(pair.valid), dtype=bool)
+    if count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+        return Verdict(Status.TOO_FEW_MATCHES, nothing)
+    if model is None:
+        return Verdict(Status.NO_GEOMETRY, nothing)
+    threshold = options.refine_threshold_px / pair.focal_px
+    fitted = pair.correspondences[order]
+    inlier_rows = order[sampson_distance(fitted, model.M) < threshold]
+    inliers = pair.correspondences[inlier_rows]
+    if any(degeneracy.is_collinear(part, threshold) for part in (inliers[:, :2], inliers[:, 2:])):
+        return Verdict(Status.NO_GEOMETRY, nothing)
+    support = degeneracy.measure_support(fitted, model.M, threshold)
+    info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
+    suspicious = _contradicts_intrinsics(pair, order, support, options)
+    if support.log10_nfa > degeneracy.UNRELATED_LOG10_NFA and not suspicious:
+        return Verdict(Status.UNRELATED, nothing, info=info)
+    verdict = _keep_model(pair, model, mask_threshold_px, info)
+    if suspicious:
+        return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
+    if support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA:
+        return replace(verdict, status=Status.LOW_SUPPORT)
+    return _test_degenerate(pair, model, inlier_rows, mask_threshold_px, options, verdict)
+
+
+def count_distinct(correspondences: Array) -> int:
+    """Number of distinct rows of (N, 4)."""
+    return len(np.unique(correspondences, axis=0))
+
+
+def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, info: dict[str, Any]) -> Verdict:
+    """The model as it is, with the mask of all matches."""
+    F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
+    mask = np.zeros(len(pair.valid), dtype=bool)
+    if pair.calibrated:
+        distance_px = sampson_distance(pair.correspondences[pair.valid], model.M) * pair.focal_px
+    else:
+        distance_px = sampson_distance(np.hstack(pair.pixels(pair.valid)), F)
+    mask[pair.valid] = distance_px < mask_threshold_px
+    return Verdict(Status.OK, mask, model.E, F, model.R, model.t, info)
+
+
+def _contradicts_intrinsics(
+    pair: PairInput, order: NDArray[np.intp], support: degeneracy.Support, options: RobustFitOptions
+) -> bool:
+    """True where F, which knows no intrinsics, explains far more matches than the caller's intrinsics allow."""
+    if not pair.calibrated or 2 * support.count >= len(order):
+        return False
+    model = estimate_model(pair.correspondences, order, pair.focal_px, options, calibrated=False)
+    if model is None:
+        return False
+    threshold = options.refine_threshold_px / pair.focal_px
+    free = degeneracy.measure_support(pair.correspondences[order], model.M, threshold)
+    return (
+        free.count >= degeneracy.INTRINSICS_SUPPORT_FACTOR * support.count + degeneracy.MIN_SUPPORT
+        and free.log10_nfa < degeneracy.LOW_SUPPORT_LOG10_NFA
+    )
+
+
+def _test_degenerate(
+    pair: PairInput,
+    model: TwoViewModel,
+    inlier_rows: NDArray[np.intp],
+    mask_threshold_px: float,
+    options: RobustFitOptions,
+    verdict: Verdict,
+) -> Verdict:
+    """Replace the verdict where a rotation or a plane explains the inliers as well."""
+    threshold_px = options.refine_threshold_px
+    points1, points2 = pair.pixels(inlier_rows)
+    K1, K2 = pair.intrinsics1.K, pair.intrinsics2.K
+    R = degeneracy.fit_rotation(pair.correspondences[inlier_rows], threshold_px / pair.focal_px, model.R)
+    H = K2 @ R @ np.linalg.inv(K1)
+    if degeneracy.explains(degeneracy.homography_distance(points1, points2, H), threshold_px):
+        mask = np.zeros(len(pair.valid), dtype=bool)
+        mask[pair.valid] = degeneracy.homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
+        info = {**verdict.info, "homography": H / H[2, 2]}
+        return Verdict(Status.PURE_ROTATION, mask, R=R, info=info)
+    plane = fit_homography(points1, points2, degeneracy.EXPLAINED_THRESHOLD_FACTOR * threshold_px, options.seed)
+    if plane is not None and degeneracy.explains(
+        degeneracy.homography_distance(points1, points2, plane), threshold_px
+    ):
+        info = {**verdict.info, "homography": plane}
+        if pair.calibrated:
+            return replace(verdict, status=Status.PLANAR, info=info)
+        # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
+        return replace(verdict, status=Status.PLANAR, E=None, R=None, t=None, info=info)
+    return verdict

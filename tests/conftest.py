@@ -1,0 +1,158 @@
+"""Fixtures: two-view scenes with a known pose, and a tiny model that obeys the ONNX contract."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from mgca_filter import MatchFilter
+from mgca_filter.correspondences import MatchAttributes
+from mgca_filter.epipolar import essential_from_pose
+from mgca_filter.pose_refinement import rotation_from_vector
+
+K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
+SIZE = (640, 480)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Synthetic pair: pixels (M, 2) under ``K``, which rows are right, pose, attributes as a matcher gives them."""
+
+    points1: np.ndarray
+    points2: np.ndarray
+    inlier: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    attributes: MatchAttributes
+
+    @property
+    def E(self) -> np.ndarray:
+        return essential_from_pose(self.R, self.t)
+
+    def keypoints(self) -> tuple[list[cv2.KeyPoint], list[cv2.KeyPoint]]:
+        return tuple([cv2.KeyPoint(float(x), float(y), 4.0, 30.0) for x, y in p] for p in (self.points1, self.points2))
+
+    def knn_matches(self) -> list[tuple[cv2.DMatch, cv2.DMatch]]:
+        ratio = self.attributes.ratio
+        return [
+            (cv2.DMatch(i, i, 100.0 * float(ratio[i])), cv2.DMatch(i, (i + 1) % len(ratio), 100.0))
+            for i in range(len(ratio))
+        ]
+
+
+def make_scene(
+    kind: str = "general", right: int = 120, wrong: int = 80, noise_px: float = 0.3, seed: int = 0
+) -> Scene:
+    """A scene of ``kind`` general, planar, rotation or collinear, with wrong matches drawn at random."""
+    rng = np.random.default_rng(seed)
+    R = rotation_from_vector(np.array([0.05, -0.12, 0.03]))
+    t = np.zeros(3) if kind == "rotation" else np.array([1.0, 0.2, 0.1])
+    pixels = rng.uniform([20, 20], [620, 460], (right, 2))
+    depth = np.full(right, 5.0) + (0.4 * (pixels[:, 0] - 320) / 320 if kind == "planar" else rng.uniform(-1, 6, right))
+    if kind == "planar":  # 1 / depth is affine in the pixels on any plane
+        depth = 1.0 / (0.2 + 0.05 * (pixels[:, 0] - 320) / 320)
+    if kind == "collinear":
+        pixels = np.stack([pixels[:, 0], 0.5 * pixels[:, 0] + 60], axis=1)
+        depth = np.full(right, 5.0)
+    X1 = np.column_stack([(pixels - K[:2, 2]) / K[0, 0], np.ones(right)]) * depth[:, None]
+    X2 = X1 @ R.T + t
+    pixels2 = X2[:, :2] / X2[:, 2:] * K[0, 0] + K[:2, 2]
+    points1 = np.vstack([pixels, rng.uniform([0, 0], SIZE, (wrong, 2))])
+    points2 = np.vstack([pixels2, rng.uniform([0, 0], SIZE, (wrong, 2))])
+    points1, points2 = points1 + rng.normal(0, noise_px, points1.shape), points2 + rng.normal(0, noise_px, points2.shape)
+    inlier = np.arange(right + wrong) < right
+    ratio = np.where(inlier, rng.uniform(0.3, 0.85, len(inlier)), rng.uniform(0.7, 1.0, len(inlier)))
+    rows = rng.permutation(len(inlier))
+    unit = t / np.linalg.norm(t) if t.any() else t
+    attributes = MatchAttributes(ratio=ratio[rows].astype(np.float32), best=np.ones(len(rows), dtype=bool))
+    return Scene(points1[rows], points2[rows], inlier[rows], R, unit, attributes)
+
+
+METADATA = {
+    "contract_version": "1",
+    "name": "ratio_test",
+    "version": "0",
+    "git_commit": "none",
+    "training_data": "none",
+    "detector": "any",
+    "config": "{}",
+    "normalization": "none",
+    "calibration": json.dumps({"scale": 1.0, "offset": 0.0}),
+    "decision_threshold": "0.0",
+    "candidate_rule": json.dumps({"max_ratio": 0.95, "min_count": 32}),
+    "prior": json.dumps(
+        {"weight1": [[1.0, 0, 0, 0, 0, 0, 0, 0]], "bias1": [0.0], "weight2": [-8.0], "bias2": 3.0}
+    ),
+    "license": "none",
+    "minimum_onnxruntime": "1.17",
+}
+
+
+def build_model(
+    path: Path,
+    metadata: dict[str, str] | None = None,
+    input_names: tuple[str, str] = ("correspondences", "attributes"),
+    output_names: tuple[str, str] = ("logits", "essential"),
+) -> Path:
+    """Write a model of the contract: logit = 8 (0.8 − ratio), fixed essential matrix.
+
+    Where the ratio is unknown (zero) every match is accepted.
+    """
+    constants = {
+        "weight": np.array([[-8.0], [0], [0], [0], [0], [0], [0], [0]], dtype=np.float32),
+        "bias": np.array([6.4], dtype=np.float32),
+        "axis": np.array([-1], dtype=np.int64),
+        "flat": np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]]], dtype=np.float32) / np.float32(np.sqrt(2)),
+        "zero": np.zeros((1,), dtype=np.float32),
+        "both": np.array([1, 2], dtype=np.int64),
+    }
+    nodes = [
+        helper.make_node("MatMul", [input_names[1], "weight"], ["product"]),
+        helper.make_node("Add", ["product", "bias"], ["biased"]),
+        helper.make_node("Squeeze", ["biased", "axis"], [output_names[0]]),
+        helper.make_node("ReduceMean", [input_names[0]], ["mean"], axes=[1, 2], keepdims=1),
+        helper.make_node("Mul", ["mean", "zero"], ["nothing"]),
+        helper.make_node("Add", ["nothing", "flat"], [output_names[1]]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "ratio_test",
+        [
+            helper.make_tensor_value_info(input_names[0], TensorProto.FLOAT, ["B", "N", 4]),
+            helper.make_tensor_value_info(input_names[1], TensorProto.FLOAT, ["B", "N", 8]),
+        ],
+        [
+            helper.make_tensor_value_info(output_names[0], TensorProto.FLOAT, ["B", "N"]),
+            helper.make_tensor_value_info(output_names[1], TensorProto.FLOAT, ["B", 3, 3]),
+        ],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    helper.set_model_props(model, METADATA if metadata is None else metadata)
+    onnx.checker.check_model(model)
+    onnx.save(model, str(path))
+    return path
+
+
+@pytest.fixture(scope="session")
+def model_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """ONNX file whose logits are a soft ratio test."""
+    return build_model(tmp_path_factory.mktemp("model") / "ratio_test.onnx")
+
+
+@pytest.fixture
+def match_filter(model_file: Path) -> MatchFilter:
+    return MatchFilter(model=model_file)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    """120 right and 80 wrong matches of a general scene."""
+    return make_scene()
