@@ -51,9 +51,12 @@ def judge(
     fitted = pair.correspondences[order]
     inlier_rows = order[sampson_distance(fitted, model.M) < threshold]
     inliers = pair.correspondences[inlier_rows]
-    if any(degeneracy.is_collinear(part, threshold) for part in (inliers[:, :2], inliers[:, 2:])):
+    if len(inliers) < MIN_MATCHES:
         return Verdict(Status.NO_GEOMETRY, nothing)
     support = degeneracy.measure_support(fitted, model.M, threshold)
+    for part in (inliers[:, :2], inliers[:, 2:]):
+        if degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
+            return Verdict(Status.NO_GEOMETRY, nothing)
     info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
     suspicious = _contradicts_intrinsics(pair, order, support, options)
     if support.log10_nfa > degeneracy.UNRELATED_LOG10_NFA and not suspicious:
@@ -63,7 +66,7 @@ def judge(
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
     if support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA:
         return replace(verdict, status=Status.LOW_SUPPORT)
-    return _test_degenerate(pair, model, inlier_rows, mask_threshold_px, options, verdict)
+    return _test_degenerate(pair, inlier_rows, support, mask_threshold_px, options, verdict)
 
 
 def count_distinct(correspondences: Array) -> int:
@@ -102,8 +105,8 @@ def _contradicts_intrinsics(
 
 def _test_degenerate(
     pair: PairInput,
-    model: TwoViewModel,
     inlier_rows: NDArray[np.intp],
+    support: degeneracy.Support,
     mask_threshold_px: float,
     options: RobustFitOptions,
     verdict: Verdict,
@@ -112,16 +115,16 @@ def _test_degenerate(
     threshold_px = options.refine_threshold_px
     points1, points2 = pair.pixels(inlier_rows)
     K1, K2 = pair.intrinsics1.K, pair.intrinsics2.K
-    R = degeneracy.fit_rotation(pair.correspondences[inlier_rows], threshold_px / pair.focal_px, model.R)
+    R = degeneracy.fit_rotation(pair.correspondences[inlier_rows], threshold_px / pair.focal_px)
     H = K2 @ R @ np.linalg.inv(K1)
-    if degeneracy.explains(degeneracy.homography_distance(points1, points2, H), threshold_px):
+    if degeneracy.explains(degeneracy.homography_distance(points1, points2, H), threshold_px, support):
         mask = np.zeros(len(pair.valid), dtype=bool)
         mask[pair.valid] = degeneracy.homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
         info = {**verdict.info, "homography": H / H[2, 2]}
         return Verdict(Status.PURE_ROTATION, mask, R=R, info=info)
     plane = fit_homography(points1, points2, degeneracy.EXPLAINED_THRESHOLD_FACTOR * threshold_px, options.seed)
     if plane is not None and degeneracy.explains(
-        degeneracy.homography_distance(points1, points2, plane), threshold_px
+        degeneracy.homography_distance(points1, points2, plane), threshold_px, support
     ):
         info = {**verdict.info, "homography": plane}
         if pair.calibrated:
