@@ -180,11 +180,11 @@ def courtyard(seed: int = 4) -> list[Face]:
 
 
 def cameras() -> tuple[Camera, Camera]:
-    """The two views: 4.7 m apart at 5 … 10 m from the scene, the second one rolled."""
+    """The two views: 5.5 m apart at 5 … 10 m from the scene, the second one rolled."""
     size, focal_px = (1024, 768), 820.0
     return (
         look_at((-2.5, -0.1, -0.6), (-0.2, -0.3, 8.0), 0.0, focal_px, size),
-        look_at((2.5, -0.6, 0.3), (0.0, -0.3, 8.0), 9.0, focal_px, size),
+        look_at((2.8, -0.7, 0.6), (0.1, -0.3, 8.0), 12.0, focal_px, size),
     )
 
 
@@ -210,7 +210,7 @@ def main() -> None:
     faces, (camera1, camera2) = courtyard(), cameras()
     options.out.mkdir(parents=True, exist_ok=True)
     left = expose(render(faces, camera1, options.supersampling), (1.06, 1.05, 1.05), 0.95, 0.5, 0.02, seed=1)
-    right = expose(render(faces, camera2, options.supersampling), (0.72, 0.84, 0.98), 1.25, 0.9, 0.05, seed=2)
+    right = expose(render(faces, camera2, options.supersampling), (0.72, 0.84, 0.98), 1.35, 1.3, 0.08, seed=2)
     for name, image in (("left.jpg", left), ("right.jpg", right)):
         cv2.imwrite(str(options.out / name), image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     R = camera2.R @ camera1.R.T

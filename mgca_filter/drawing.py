@@ -114,7 +114,7 @@ def _side_by_side(image1: Image, image2: Image) -> tuple[Image, _Place, _Place]:
     """Dimmed canvas with both images at one height, and their places."""
     (h1, w1), (h2, w2) = image1.shape[:2], image2.shape[:2]
     aspect = w1 / h1 + w2 / h2
-    natural_width = max(h1, h2) * aspect
+    natural_width = max(h1, h2) * aspect + GAP_PX
     width = min(max(natural_width, MIN_WIDTH_PX), MAX_WIDTH_PX) - GAP_PX
     height = max(1, round(width / aspect))
     width1 = max(1, round(w1 * height / h1))

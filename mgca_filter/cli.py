@@ -1,0 +1,223 @@
+"""``mgca-match``: two images in; a summary, a picture, JSON and NPZ out."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import math
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from . import __version__
+from .cli_output import MatchReport, picture, summary, to_json, write_npz
+from .comparison import BaselineFit, comparison_table, fit_baselines
+from .errors import MgcaFilterError
+from .image_matching import match_images
+
+EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
+_EPILOG = """\
+exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
+1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""
+
+_log = logging.getLogger("mgca_filter")
+
+
+class UsageError(Exception):
+    """One line for the user; the command exits with 2."""
+
+
+class _OneLineParser(argparse.ArgumentParser):
+    """argparse without the usage block in front of each error."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+def _intrinsics(text: str) -> NDArray[np.float64]:
+    """K (3, 3) from ``fx,fy,cx,cy``."""
+    try:
+        fx, fy, cx, cy = (float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected fx,fy,cx,cy in pixels, got {text!r}") from None
+    if not all(math.isfinite(value) for value in (fx, fy, cx, cy)) or fx <= 0 or fy <= 0:
+        raise argparse.ArgumentTypeError(f"expected finite numbers and positive focal lengths, got {text!r}")
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _positive(kind: type[int] | type[float]) -> Any:
+    def parse(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"expected a number, got {text!r}") from None
+        if not math.isfinite(value) or value <= 0:
+            raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
+        return value
+
+    return parse
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The command's arguments."""
+    parser = _OneLineParser(
+        prog="mgca-match",
+        description="Match two images and keep the matches that agree with one camera motion.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("image1", metavar="img1", type=Path)
+    parser.add_argument("image2", metavar="img2", type=Path)
+    out = parser.add_argument_group("output")
+    out.add_argument("-o", "--output", metavar="OUT.png", type=Path, help="picture of kept and rejected matches")
+    out.add_argument("--json", metavar="FILE", help='pose, status and kept matches; "-" = alone on stdout')
+    out.add_argument("--npz", metavar="FILE", type=Path, help="points, scores, mask and models as numpy arrays")
+    out.add_argument("--compare", action="store_true", help="run RANSAC and MAGSAC on the same matches as well")
+    out.add_argument("-q", "--quiet", action="store_true", help="no summary, errors only")
+    out.add_argument("-v", "--verbose", action="store_true", help="log what is done, on stderr")
+    camera = parser.add_argument_group("cameras", "fx,fy,cx,cy in pixels; without them the focal length is guessed")
+    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=_intrinsics, help="intrinsics of both images")
+    camera.add_argument("--K1", metavar="fx,fy,cx,cy", type=_intrinsics, help="of the first image, with --K2")
+    camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=_intrinsics, help="of the second image, with --K1")
+    matching = parser.add_argument_group("matching")
+    matching.add_argument("--detector", choices=("sift", "orb", "akaze"), default="sift")
+    matching.add_argument("--max-keypoints", metavar="N", type=_positive(int), default=2000, help="default 2000")
+    matching.add_argument("--threshold", metavar="PX", type=_positive(float), default=1.0, help="pixels, default 1.0")
+    matching.add_argument(
+        "--method", choices=("prosac", "magsac", "ransac", "poselib", "none"), default="prosac", help="robust fit"
+    )
+    matching.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
+    matching.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
+    matching.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--version", action="version", version=f"mgca-match {__version__}")
+    return parser
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """Colour image (h, w, 3) BGR uint8, upright as its EXIF says.
+
+    Raises:
+        UsageError: the file cannot be read or decoded; the message names it.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from error
+    if not data:
+        raise UsageError(f"{path}: the file is empty")
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    except (cv2.error, MemoryError) as error:
+        # OpenCV refuses more than 2^30 pixels unless OPENCV_IO_MAX_IMAGE_PIXELS says otherwise.
+        raise UsageError(f"{path}: OpenCV cannot decode it; it is broken or too large") from error
+    if image is None:
+        raise UsageError(f"{path}: not an image that OpenCV can decode")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Complain about output paths before the work rather than after it."""
+    json_path = None if options.json in (None, "-") else Path(options.json)
+    for path in (options.output, json_path, options.npz):
+        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+            raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
+    if options.output is not None and not cv2.haveImageWriter(str(options.output)):
+        raise UsageError(f"{options.output}: OpenCV cannot write pictures of this type, use .png or .jpg")
+
+
+def _camera_matrices(options: argparse.Namespace) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    if (options.K1 is None) != (options.K2 is None):
+        raise UsageError("--K1 and --K2 go together; --K is for both images")
+    if options.K is not None and options.K1 is not None:
+        raise UsageError("--K excludes --K1 and --K2")
+    return (options.K, options.K) if options.K is not None else (options.K1, options.K2)
+
+
+def _match(options: argparse.Namespace) -> MatchReport:
+    """Read, match, filter and, with ``--compare``, fit the baselines."""
+    K1, K2 = _camera_matrices(options)
+    _check_outputs(options)
+    image1, image2 = read_image(options.image1), read_image(options.image2)
+    _log.info("%s: %d x %d, %s: %d x %d", options.image1, *image1.shape[1::-1], options.image2, *image2.shape[1::-1])
+    start = time.perf_counter()
+    matched = match_images(
+        image1,
+        image2,
+        detector=options.detector,
+        max_keypoints=options.max_keypoints,
+        K1=K1,
+        K2=K2,
+        threshold=options.threshold,
+        method=options.method,
+        model=options.model,
+        providers=options.providers.split(",") if options.providers else None,
+        seed=options.seed,
+    )
+    total_ms = 1e3 * (time.perf_counter() - start)
+    for assumption in matched.result.info.get("assumptions", ()):
+        _log.info("assumed: %s", assumption)
+    report = MatchReport(options.image1, options.image2, image1, image2, K1, K2, matched, total_ms)
+    if not options.compare:
+        return report
+    baselines: list[BaselineFit] = fit_baselines(
+        report.points1,
+        report.points2,
+        K1,
+        K2,
+        size1=report.sizes[0],
+        size2=report.sizes[1],
+        threshold_px=options.threshold,
+        seed=options.seed,
+    )
+    return report.with_baselines(baselines)
+
+
+def _write(report: MatchReport, options: argparse.Namespace) -> None:
+    json_alone = options.json == "-"
+    if not options.quiet:
+        words = summary(report)
+        if report.baselines is not None:
+            words += "\n\n" + comparison_table(report.result, report.filter_ms, report.baselines)
+        print(words, file=sys.stderr if json_alone else sys.stdout)
+    if json_alone:
+        print(to_json(report))
+    elif options.json:
+        Path(options.json).write_text(to_json(report) + "\n", encoding="utf-8")
+    if options.npz:
+        write_npz(options.npz, report)
+    if options.output and not cv2.imwrite(str(options.output), picture(report)):
+        raise UsageError(f"{options.output}: cannot be written")
+
+
+def _log_to_stderr(level: int) -> None:
+    """Send the package's log, and no other library's, to stderr; a second call replaces the first."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("mgca-match: %(message)s"))
+    _log.handlers[:] = [handler]
+    _log.setLevel(level)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
+    try:
+        options = build_parser().parse_args(arguments)
+        _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)
+        report = _match(options)
+        _write(report, options)
+    except OSError as error:  # of an output file; the inputs have their own message
+        print(f"mgca-match: {error.filename}: {error.strerror}", file=sys.stderr)
+        return EXIT_USAGE
+    except (UsageError, MgcaFilterError, ImportError, ValueError, TypeError) as error:
+        print(f"mgca-match: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_USAGE
+    return EXIT_FOUND if report.found_geometry else EXIT_NO_GEOMETRY
+
+
+if __name__ == "__main__":
+    sys.exit(main())

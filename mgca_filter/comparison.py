@@ -1,0 +1,107 @@
+"""RANSAC and MAGSAC on the raw matches, to be read next to the filter's answer."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .correspondences import mean_focal_length
+from .epipolar import rotation_error_deg, sampson_distance
+from .intrinsics import resolve_intrinsics
+from .result import FilterResult
+from .robust_fit import RobustFitOptions, estimate_model
+
+BASELINES = {"RANSAC": "ransac", "MAGSAC": "magsac"}
+
+
+@dataclass(frozen=True)
+class BaselineFit:
+    """What an estimator makes of all matches, unscored and in the order they came.
+
+    Attributes:
+        name: "RANSAC" or "MAGSAC".
+        mask: bool (M,), Sampson distance below the threshold under the estimator's model, as in ``FilterResult``.
+        E: (3, 3) of unit Frobenius norm, R: (3, 3), t: (3,) unit norm; None where nothing was found.
+        fit_ms: time of the estimator, milliseconds.
+    """
+
+    name: str
+    mask: NDArray[np.bool_]
+    E: NDArray[np.float64] | None
+    R: NDArray[np.float64] | None
+    t: NDArray[np.float64] | None
+    fit_ms: float
+
+    @property
+    def num_inliers(self) -> int:
+        """Number of True in ``mask``."""
+        return int(np.count_nonzero(self.mask))
+
+
+def fit_baselines(
+    points1: NDArray[np.float64],
+    points2: NDArray[np.float64],
+    K1: NDArray[np.float64] | None,
+    K2: NDArray[np.float64] | None,
+    *,
+    size1: tuple[int, int],
+    size2: tuple[int, int],
+    threshold_px: float,
+    seed: int = 0,
+) -> list[BaselineFit]:
+    """Fit by each baseline, with the filter's threshold and OpenCV's usual confidence.
+
+    Args:
+        points1, points2: matched pixels (M, 2), row by row.
+        K1, K2: (3, 3) intrinsics, or None: a fundamental matrix is fitted then, and the pose rests on a guess.
+        size1, size2: (width, height) of the images, for that guess.
+        threshold_px: inlier threshold, pixels.
+        seed: of the estimators' random numbers.
+    """
+    camera1, camera2 = resolve_intrinsics(points1, points2, K1=K1, K2=K2, size1=size1, size2=size2)
+    correspondences = np.hstack([camera1.normalize(points1), camera2.normalize(points2)])
+    focal_px = mean_focal_length(camera1.K, camera2.K)
+    fits = []
+    for name, method in BASELINES.items():
+        options = RobustFitOptions(
+            method=method, threshold_px=threshold_px, confidence=0.999, seed=seed, refine=False
+        )
+        start = time.perf_counter()
+        model = estimate_model(
+            correspondences, np.arange(len(correspondences)), focal_px, options, calibrated=not camera1.guessed
+        )
+        fit_ms = 1e3 * (time.perf_counter() - start)
+        if model is None:
+            fits.append(BaselineFit(name, np.zeros(len(points1), bool), None, None, None, fit_ms))
+            continue
+        mask = sampson_distance(correspondences, model.M) * focal_px < threshold_px
+        fits.append(BaselineFit(name, mask, model.E, model.R, model.t, fit_ms))
+    return fits
+
+
+def describe_rotation(R: NDArray[np.float64] | None) -> str:
+    """Angle of the rotation in words, "-" where there is none."""
+    return "-" if R is None else f"{rotation_error_deg(R, np.eye(3)):.1f} deg"
+
+
+def describe_translation(t: NDArray[np.float64] | None) -> str:
+    """Direction of the translation in words, "-" where there is none."""
+    return "-" if t is None else "(" + ", ".join(f"{value:+.2f}" for value in t) + ")"
+
+
+def comparison_table(result: FilterResult, filter_ms: float, baselines: Sequence[BaselineFit]) -> str:
+    """Counts, poses and times of the filter and the baselines, one row each.
+
+    A count of kept matches is no accuracy: a wrong model gathers matches as well.
+    """
+    rows = [("mgca_filter", result.num_inliers, result.R, result.t, filter_ms)]
+    rows += [(fit.name, fit.num_inliers, fit.R, fit.t, fit.fit_ms) for fit in baselines]
+    lines = [f"{'':<12} {'kept':>6}  {'rotation':>9}  {'translation':<21}  {'time':>9}"]
+    for name, kept, R, t, ms in rows:
+        rotation, translation = describe_rotation(R), describe_translation(t)
+        lines.append(f"{name:<12} {kept:>6}  {rotation:>9}  {translation:<21}  {ms:>6.0f} ms")
+    return "\n".join(lines)

@@ -1,0 +1,262 @@
+"""``mgca-match``: exit status, what goes to which stream, files written, one-line errors."""
+
+import json
+import os
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import mgca_filter
+from mgca_filter import cli
+from mgca_filter.epipolar import pose_error_deg, sampson_distance
+
+ROOT = Path(__file__).parent.parent
+IMAGES = ROOT / "examples" / "images"
+LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
+K_WORDS = "820,820,511.5,383.5"
+JSON_KEYS = {
+    "version", "image1", "image2", "status", "num_matches", "num_inliers", "E", "F", "R", "t", "K1", "K2", "homography",
+    "intrinsics", "assumptions", "backend", "model", "model_sha256", "timings_ms", "kept",
+}  # fmt: skip
+
+
+def run_command(*arguments: str) -> subprocess.CompletedProcess:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "mgca_filter.cli", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=environment)
+
+
+@pytest.fixture(scope="module")
+def outputs(tmp_path_factory, model_file):
+    """One full run on the example pair: folder with the files, and the finished process."""
+    folder = tmp_path_factory.mktemp("outputs")
+    files = ["-o", str(folder / "m.png"), "--npz", str(folder / "m.data"), "--json", "-"]
+    done = run_command(LEFT, RIGHT, "--K", K_WORDS, "--model", str(model_file), "--compare", *files)
+    assert done.returncode == 0, done.stderr
+    return folder, done
+
+
+@pytest.fixture(scope="module")
+def document(outputs) -> dict:
+    return json.loads(outputs[1].stdout)
+
+
+@pytest.fixture
+def unrelated(tmp_path) -> str:
+    """An image file of noise."""
+    path = tmp_path / "noise.png"
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (120, 160), dtype=np.uint8))
+    return str(path)
+
+
+def assert_usage_error(capsys, arguments: list[str], *words: str) -> None:
+    """Exit status 2, nothing on stdout, one line on stderr with all the words."""
+    assert cli.main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith("mgca-match: ")
+    for word in words:
+        assert word in err
+
+
+def test_shipped_model_finds_the_exact_pose(tmp_path):
+    """What the README's first command does."""
+    done = run_command(LEFT, RIGHT, "--K", K_WORDS, "--json", str(tmp_path / "pair.json"))
+    assert done.returncode == 0, done.stderr
+    assert "status ok" in done.stdout
+    found = json.loads((tmp_path / "pair.json").read_text())
+    truth = json.loads((IMAGES / "pair.json").read_text())
+    assert pose_error_deg(found["R"], found["t"], truth["R"], truth["t"]) < 2.0
+
+
+def test_json_has_every_key_and_agrees_with_itself(document):
+    assert set(document) == JSON_KEYS | {"comparison"}
+    assert document["version"] == mgca_filter.__version__
+    assert document["status"] == "ok"
+    assert document["intrinsics"] == "given"
+    assert document["image1"]["width"] == 1024
+    assert document["image2"]["height"] == 768
+    assert document["num_matches"] == document["image1"]["num_keypoints"]
+    kept = document["kept"]
+    assert {len(values) for values in kept.values()} == {document["num_inliers"]}
+    points = np.hstack([kept["points1"], kept["points2"]])
+    assert sampson_distance(points, document["F"]).max() < 1.1
+    np.testing.assert_array_equal(document["K1"], [[820, 0, 511.5], [0, 820, 383.5], [0, 0, 1]])
+
+
+def test_summary_and_table_go_to_stderr_when_json_has_stdout(outputs, document):
+    summary = outputs[1].stderr
+    assert f"{document['num_matches']} matches in, {document['num_inliers']} kept" in summary
+    for name in ("mgca_filter", "RANSAC", "MAGSAC"):
+        assert any(line.startswith(name) for line in summary.splitlines())
+    assert "error" not in summary
+
+
+def test_comparison_is_on_the_same_matches(document):
+    for fit in document["comparison"]:
+        assert set(fit) == {"name", "num_inliers", "E", "R", "t", "fit_ms"}
+        assert 0 < fit["num_inliers"] <= document["num_matches"]
+        np.testing.assert_allclose(np.linalg.det(fit["R"]), 1.0, atol=1e-9)
+    assert [fit["name"] for fit in document["comparison"]] == ["RANSAC", "MAGSAC"]
+
+
+def test_npz_keeps_its_name_and_holds_the_same_answer(outputs, document):
+    with np.load(outputs[0] / "m.data", allow_pickle=False) as arrays:
+        count = document["num_matches"]
+        assert arrays["points1"].shape == arrays["points2"].shape == arrays["indices"].shape == (count, 2)
+        assert arrays["scores"].shape == arrays["mask"].shape == (count,)
+        assert arrays["scores"].dtype == np.float32
+        assert arrays["mask"].sum() == document["num_inliers"]
+        assert str(arrays["status"]) == "ok"
+        for name in ("E", "F", "R", "t", "K1", "K2"):
+            np.testing.assert_array_equal(arrays[name], document[name])
+        np.testing.assert_array_equal(arrays["points1"][arrays["mask"]], document["kept"]["points1"])
+
+
+def test_picture_is_written(outputs):
+    picture = cv2.imread(str(outputs[0] / "m.png"))
+    assert picture.shape[1] == 1600
+
+
+def test_no_geometry_exits_with_1_and_still_writes(tmp_path, unrelated, model_file, capsys):
+    files = ["-o", str(tmp_path / "m.png"), "--npz", str(tmp_path / "m.npz"), "--json", str(tmp_path / "m.json")]
+    status = cli.main([LEFT, unrelated, "--model", str(model_file), "--max-keypoints", "300", "--compare", *files])
+    assert status == 1
+    found = json.loads((tmp_path / "m.json").read_text())
+    assert found["num_inliers"] == len(found["kept"]["scores"])
+    assert found["intrinsics"] == "guessed"
+    assert "status " + found["status"] in capsys.readouterr().out
+    assert cv2.imread(str(tmp_path / "m.png")) is not None
+    with np.load(tmp_path / "m.npz") as arrays:
+        assert set(arrays.files) >= {"points1", "points2", "scores", "mask"}
+
+
+def test_images_without_a_keypoint_exit_with_1(tmp_path, model_file, capsys):
+    path = tmp_path / "flat.png"
+    cv2.imwrite(str(path), np.full((40, 60), 128, np.uint8))
+    files = ["-o", str(tmp_path / "m.png"), "--npz", str(tmp_path / "m.npz")]
+    assert cli.main([str(path), str(path), "--model", str(model_file), "--compare", *files]) == 1
+    assert "0 matches in, 0 kept, status too_few_matches" in capsys.readouterr().out
+
+
+def test_quiet_says_nothing(unrelated, model_file, capsys):
+    cli.main([unrelated, unrelated, "--model", str(model_file), "--max-keypoints", "50", "-q"])
+    assert capsys.readouterr() == ("", "")
+
+
+def test_verbose_logs_on_stderr(unrelated, model_file, capsys):
+    cli.main([unrelated, unrelated, "--model", str(model_file), "--max-keypoints", "50", "-v"])
+    assert "guessed" in capsys.readouterr().err
+
+
+def test_same_seed_same_bytes(unrelated, model_file, tmp_path):
+    arguments = [unrelated, unrelated, "--model", str(model_file), "--max-keypoints", "100", "-q"]
+    for name in ("a.npz", "b.npz"):
+        cli.main([*arguments, "--npz", str(tmp_path / name)])
+    with np.load(tmp_path / "a.npz") as first, np.load(tmp_path / "b.npz") as second:
+        assert all(np.array_equal(first[name], second[name]) for name in first.files)
+
+
+K_A, K_B = np.array([[5.0, 0, 3], [0, 6, 4], [0, 0, 1]]), np.array([[7.0, 0, 1], [0, 8, 2], [0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ([], {"detector": "sift", "max_keypoints": 2000, "threshold": 1.0, "method": "prosac", "seed": 0}),
+        ([], {"K1": None, "K2": None, "model": None, "providers": None}),
+        (["--detector", "orb"], {"detector": "orb"}),
+        (["--max-keypoints", "77"], {"max_keypoints": 77}),
+        (["--threshold", "2.5"], {"threshold": 2.5}),
+        (["--method", "magsac"], {"method": "magsac"}),
+        (["--model", "m.onnx"], {"model": Path("m.onnx")}),
+        (["--providers", "A,B"], {"providers": ["A", "B"]}),
+        (["--seed", "9"], {"seed": 9}),
+        (["--K", "5,6,3,4"], {"K1": K_A, "K2": K_A}),
+        (["--K1", "5,6,3,4", "--K2", "7,8,1,2"], {"K1": K_A, "K2": K_B}),
+    ],
+)
+def test_every_option_reaches_the_filter(monkeypatch, words, expected):
+    seen = {}
+
+    def record(image1, image2, **options):
+        seen.update(options)
+        raise ValueError("seen enough")
+
+    monkeypatch.setattr(cli, "match_images", record)
+    assert cli.main([LEFT, RIGHT, *words]) == 2
+    for name, value in expected.items():
+        np.testing.assert_array_equal(seen[name], value, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["820,820,511.5", "a,b,c,d", "0,820,1,1", "820,-1,1,1", "nan,820,1,1", "820,820,inf,1", ""],
+)
+def test_wrong_intrinsics(capsys, words):
+    assert_usage_error(capsys, [LEFT, RIGHT, f"--K={words}"], "--K", "fx,fy,cx,cy" if "," not in words else "expected")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], ["img1"]),
+        ([LEFT], ["img2"]),
+        ([LEFT, RIGHT, "--nonsense"], ["--nonsense"]),
+        ([LEFT, RIGHT, "--K1", K_WORDS], ["--K2"]),
+        ([LEFT, RIGHT, "--K", K_WORDS, "--K1", K_WORDS, "--K2", K_WORDS], ["excludes"]),
+        ([LEFT, RIGHT, "--detector", "surf"], ["--detector", "surf"]),
+        ([LEFT, RIGHT, "--threshold", "0"], ["--threshold"]),
+        ([LEFT, RIGHT, "--threshold", "nan"], ["--threshold"]),
+        ([LEFT, RIGHT, "--max-keypoints", "-3"], ["--max-keypoints"]),
+        ([LEFT, RIGHT, "--method", "lmeds"], ["--method"]),
+        ([LEFT, RIGHT, "--seed", "x"], ["--seed"]),
+        ([LEFT, RIGHT, "--seed", "-1"], ["seed"]),
+        ([LEFT, RIGHT, "--model", "missing.onnx"], ["missing.onnx"]),
+        ([LEFT, "missing.png"], ["missing.png", "No such file"]),
+        ([str(IMAGES), RIGHT], [str(IMAGES)]),
+        ([LEFT, str(IMAGES / "pair.json")], ["pair.json"]),
+        ([LEFT, RIGHT, "-o", "no/such/folder/m.png"], ["no/such/folder/m.png"]),
+        ([LEFT, RIGHT, "-o", "m.nonsense"], ["m.nonsense"]),
+        ([LEFT, RIGHT, "--json", str(IMAGES)], [str(IMAGES)]),
+        ([LEFT, RIGHT, "--npz", "no/such/folder/m.npz"], ["no/such/folder/m.npz"]),
+    ],
+)
+def test_misuse_is_one_line_that_names_it(capsys, arguments, words):
+    assert_usage_error(capsys, arguments, *words)
+
+
+def test_empty_file_is_named(capsys, tmp_path):
+    (tmp_path / "empty.png").touch()
+    assert_usage_error(capsys, [LEFT, str(tmp_path / "empty.png")], "empty.png")
+
+
+def test_image_too_large_to_decode_is_named(tmp_path):
+    """A PNG whose header promises 100 000 x 100 000 pixels; a real process, for the codecs write to stderr too."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0))
+    path = tmp_path / "huge.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0" * 10)) + chunk(b"IEND", b""))
+    done = run_command(LEFT, str(path))
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert "huge.png" in done.stderr
+
+
+def test_version_and_help(capsys):
+    for option, words in (("--version", mgca_filter.__version__), ("--help", "exit status")):
+        with pytest.raises(SystemExit) as stopped:
+            cli.main([option])
+        assert stopped.value.code == 0
+        assert words in capsys.readouterr().out
