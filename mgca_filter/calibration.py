@@ -58,4 +58,5 @@ def gelu(x: NDArray[np.float64]) -> NDArray[np.float64]:
     for coefficient in _ERF_COEFFICIENTS:
         polynomial = (polynomial + coefficient) * k
     erf = np.sign(x) * (1.0 - polynomial * np.exp(-z * z))
-    return 0.5 * x * (1.0 + erf)
+    activated: NDArray[np.float64] = 0.5 * x * (1.0 + erf)
+    return activated

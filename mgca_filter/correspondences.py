@@ -51,7 +51,7 @@ class MatchAttributes:
             with np.errstate(invalid="ignore"):
                 known = (size1 > 0) & (size2 > 0) & (angle1 >= 0) & (angle2 >= 0)
                 known &= np.isfinite(size1) & np.isfinite(size2) & np.isfinite(angle1) & np.isfinite(angle2)
-            turn = np.radians(np.where(known, angle2 - angle1, 0.0))
+            turn = np.radians(np.where(known, angle2, 0.0) - np.where(known, angle1, 0.0))
             encoded[:, 2] = np.log2(np.where(known, size2, 1.0) / np.where(known, size1, 1.0))
             encoded[:, 3] = np.where(known, np.cos(turn), 0.0)
             encoded[:, 4] = np.where(known, np.sin(turn), 0.0)
@@ -77,7 +77,7 @@ def candidate_mask(
     """
     ratio, best = attributes[:, 0], attributes[:, 1]
     ratio_known, best_known = attributes[:, 5] > 0, attributes[:, 6] > 0
-    hopeless = ratio_known & best_known & ((ratio >= max_ratio) | (best == 0))
+    hopeless: NDArray[np.bool_] = ratio_known & best_known & ((ratio >= max_ratio) | (best == 0))
     if len(hopeless) - np.count_nonzero(hopeless) < min_count:
         return np.ones(len(attributes), dtype=bool)
     return ~hopeless

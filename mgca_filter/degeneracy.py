@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .epipolar import homogeneous, sampson_distance
+from .homography import homography_distance
 
 Array = NDArray[np.float64]
 
@@ -97,25 +98,6 @@ def line_distance(points: Array, threshold: float) -> Array:
     return distance
 
 
-def homography_distance(points1: Array, points2: Array, H: Array) -> Array:
-    """Distance (N,) of matches to a homography ``p2 ~ H p1``, in the unit of the points.
-
-    Half the root of the summed squared transfer errors in both directions: like Sampson's, it splits the error
-    between the two images. Infinite where a point maps to infinity.
-    """
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        forward = _transfer(points1, H) - points2
-        backward = _transfer(points2, np.linalg.pinv(H)) - points1
-        distance = 0.5 * np.sqrt(np.sum(forward**2, axis=1) + np.sum(backward**2, axis=1))
-    return np.where(np.isfinite(distance), distance, np.inf)
-
-
-def _transfer(points: Array, H: Array) -> Array:
-    mapped = homogeneous(points) @ H.T
-    transferred: Array = mapped[:, :2] / mapped[:, 2:]
-    return transferred
-
-
 def fit_rotation(correspondences: Array, threshold: float) -> Array:
     """Rotation (3, 3) that best aligns the viewing rays of the matches (N, 4) (Kabsch), outliers set aside.
 
@@ -123,7 +105,7 @@ def fit_rotation(correspondences: Array, threshold: float) -> Array:
         correspondences: normalised. threshold: distance to the rotation's homography that still counts.
     """
     rays1, rays2 = (_unit(homogeneous(part)) for part in (correspondences[:, :2], correspondences[:, 2:]))
-    R = np.eye(3)
+    R: Array = np.eye(3)
     near = np.ones(len(rays1), dtype=bool)
     for _ in range(_TRIM_ROUNDS):
         U, _, Vt = np.linalg.svd(rays2[near].T @ rays1[near])
@@ -134,7 +116,8 @@ def fit_rotation(correspondences: Array, threshold: float) -> Array:
 
 
 def _unit(rays: Array) -> Array:
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit
 
 
 def explains(distance: Array, threshold: float, support: Support) -> bool:

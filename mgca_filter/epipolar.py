@@ -20,9 +20,9 @@ def cross_matrix(t: ArrayLike) -> FloatArray:
 
 def essential_from_pose(R: ArrayLike, t: ArrayLike) -> FloatArray:
     """Essential matrix (3, 3) of the relative pose ``X2 = R X1 + t``, of unit Frobenius norm."""
-    E = cross_matrix(t) @ np.asarray(R, dtype=np.float64)
-    norm = np.linalg.norm(E)
-    return E / norm if norm > 0 else E
+    E: FloatArray = cross_matrix(t) @ np.asarray(R, dtype=np.float64)
+    norm = float(np.linalg.norm(E))
+    return np.asarray(E / norm if norm > 0 else E, dtype=np.float64)
 
 
 def fundamental_from_essential(E: ArrayLike, K1: ArrayLike, K2: ArrayLike) -> FloatArray:
@@ -71,7 +71,8 @@ def sampson_distance(correspondences: ArrayLike, E: ArrayLike) -> FloatArray:
 def project_to_essential(M: ArrayLike) -> FloatArray:
     """Closest matrix with singular values (s, s, 0), scaled to unit Frobenius norm."""
     U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
-    return U @ np.diag([1.0, 1.0, 0.0]) @ Vt / np.sqrt(2.0)
+    projected: FloatArray = U @ np.diag([1.0, 1.0, 0.0]) @ Vt / np.sqrt(2.0)
+    return projected
 
 
 def decompose_essential(E: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:

@@ -38,9 +38,7 @@ class Intrinsics:
         if self.distortion is None:
             normalized[finite] = normalize_points(points[finite], self.K)
         elif finite.any():
-            undistorted = cv2.undistortPoints(
-                np.ascontiguousarray(points[finite])[:, None], self.K, self.distortion
-            )
+            undistorted = cv2.undistortPoints(np.ascontiguousarray(points[finite])[:, None], self.K, self.distortion)
             normalized[finite] = undistorted[:, 0]
         return normalized
 
@@ -117,7 +115,7 @@ def _read_K(value: Any, name: str) -> NDArray[np.float64]:
     if K.shape != (3, 3):
         raise ValueError(f"{name}: expected shape (3, 3), got {K.shape}")
     if not np.allclose(K[2], [0.0, 0.0, 1.0]) or K[1, 0] != 0 or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise ValueError(f"{name}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with positive fx, fy, got {K.tolist()}")
+        raise ValueError(f"{name}: expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0, got {K.tolist()}")
     return K
 
 
@@ -135,5 +133,5 @@ def _read_size(value: Any, name: str) -> tuple[float, float] | None:
         return None
     size = _read_numbers(value, name, "(width, height) in pixels")
     if size.shape != (2,) or (size < 1).any():
-        raise ValueError(f"{name}: expected (width, height) of at least one pixel each, got {np.shape(value)} {value!r}")
+        raise ValueError(f"{name}: expected (width, height) of at least one pixel each, got {value!r}")
     return float(size[0]), float(size[1])

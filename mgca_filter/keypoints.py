@@ -48,7 +48,9 @@ def read_keypoints(keypoints: Any, name: str = "keypoints") -> Keypoints:
         ValueError: an array of another shape.
     """
     if keypoints is None or isinstance(keypoints, (str, bytes, dict, cv2.KeyPoint)):
-        raise TypeError(f"{name}: expected a sequence of cv2.KeyPoint or an array (N, 2), got {type(keypoints).__name__}")
+        raise TypeError(
+            f"{name}: expected a sequence of cv2.KeyPoint or an array (N, 2), got {type(keypoints).__name__}"
+        )
     if isinstance(keypoints, Sequence):
         if any(isinstance(item, cv2.KeyPoint) for item in keypoints):
             return _from_cv2(keypoints, name)
@@ -93,13 +95,13 @@ def create_detector(name: str = "sift", feature_count: int = SIFT_FEATURE_COUNT)
     if feature_count < 1:
         raise ValueError(f"feature_count: expected at least 1, got {feature_count}")
     if name == "sift":
-        return cv2.SIFT_create(nfeatures=feature_count, contrastThreshold=SIFT_CONTRAST_THRESHOLD)
+        return cv2.SIFT.create(nfeatures=feature_count, contrastThreshold=SIFT_CONTRAST_THRESHOLD)
     if name == "orb":
-        return cv2.ORB_create(nfeatures=feature_count)
+        return cv2.ORB.create(nfeatures=feature_count)
     if name == "akaze":
         # OpenCV 5 moved AKAZE to the contrib module.
-        create = getattr(cv2, "AKAZE_create", None) or cv2.xfeatures2d.AKAZE_create
-        return create(max_points=feature_count)
+        akaze: type[cv2.xfeatures2d.AKAZE] = getattr(cv2, "AKAZE", None) or cv2.xfeatures2d.AKAZE
+        return akaze.create(max_points=feature_count)
     raise ValueError(f"detector: expected 'sift', 'orb', 'akaze' or a cv2.Feature2D, got {name!r}")
 
 

@@ -63,11 +63,15 @@ def read_matches(matches: Any, count1: int, count2: int, name: str = "matches") 
     """
     if matches is None:
         if count1 != count2:
-            raise ValueError(f"{name}: None means that row i matches row i, but there are {count1} and {count2} keypoints")
+            raise ValueError(
+                f"{name}: None means that row i matches row i, but there are {count1} and {count2} keypoints"
+            )
         rows = np.arange(count1, dtype=np.intp)
         return PutativeMatches(rows, rows, None, None, None)
     if isinstance(matches, (str, bytes, dict, cv2.DMatch)):
-        raise TypeError(f"{name}: expected DMatch, knnMatch output, an array (M, 2) or None, got {type(matches).__name__}")
+        raise TypeError(
+            f"{name}: expected DMatch, knnMatch output, an array (M, 2) or None, got {type(matches).__name__}"
+        )
     if not isinstance(matches, np.ndarray) and isinstance(matches, Sequence):
         if len(matches) == 0:
             none = np.zeros(0, dtype=np.intp)
@@ -125,13 +129,13 @@ def _from_array(matches: Any, count1: int, count2: int, name: str) -> PutativeMa
     return PutativeMatches(index1, index2, None, None, array)
 
 
-def _check_range(
-    index1: NDArray[np.intp], index2: NDArray[np.intp], count1: int, count2: int, name: str
-) -> None:
+def _check_range(index1: NDArray[np.intp], index2: NDArray[np.intp], count1: int, count2: int, name: str) -> None:
     for index, count, image in ((index1, count1, 1), (index2, count2, 2)):
         wrong = (index < 0) | (index >= count)
         if wrong.any():
-            raise ValueError(f"{name}: index {index[wrong][0]} is out of range for the {count} keypoints of image {image}")
+            raise ValueError(
+                f"{name}: index {index[wrong][0]} is out of range for the {count} keypoints of image {image}"
+            )
 
 
 def distance_ratio(nearest: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float32]:

@@ -9,18 +9,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import cross_matrix, sampson_distance
+from .epipolar import cross_matrix, homogeneous, sampson_distance, triangulated_depths
 
 Array = NDArray[np.float64]
 
 _INITIAL_DAMPING = 1e-4
 _MAX_DAMPING = 1e6
-_CONVERGED_STEP = 1e-10
+_SMALLEST_CURVATURE = 1e-12
+_CONVERGED_DECREASE = 1e-4
+MIN_INLIERS = 6
 
 
-def refine_pose(
-    correspondences: Array, R: Array, t: Array, threshold: float, rounds: int = 10
-) -> tuple[Array, Array]:
+def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, rounds: int = 10) -> tuple[Array, Array]:
     """Refine a relative pose on the matches within ``threshold``, which are chosen anew in every round.
 
     Args:
@@ -35,31 +35,36 @@ def refine_pose(
     cost = truncated_cost(correspondences, R, t, threshold)
     damping = _INITIAL_DAMPING
     for _ in range(rounds):
-        residuals, jacobian = _residuals_and_jacobian(correspondences, R, t)
-        inliers = np.abs(residuals) < threshold
-        if np.count_nonzero(inliers) < 6:
+        near = correspondences[sampson_distance(correspondences, cross_matrix(t) @ R) < threshold]
+        if len(near) < MIN_INLIERS:
             break
-        J, r = jacobian[inliers], residuals[inliers]
-        hessian, gradient = J.T @ J, J.T @ r
-        accepted = False
-        while not accepted and damping < _MAX_DAMPING:
-            step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian) + 1e-12), gradient)
-            R_new, t_new = _apply_step(R, t, step)
+        residuals, jacobian = _residuals_and_jacobian(near, R, t)
+        hessian, gradient = jacobian.T @ jacobian, jacobian.T @ residuals
+        previous = cost
+        while damping < _MAX_DAMPING:
+            damped = hessian + damping * np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
+            R_new, t_new = _apply_step(R, t, -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64))
             cost_new = truncated_cost(correspondences, R_new, t_new, threshold)
-            accepted = cost_new < cost
-            damping = damping * 0.1 if accepted else damping * 10.0
-        if not accepted:
-            break
-        R, t, cost = R_new, t_new, cost_new
-        if np.linalg.norm(step) < _CONVERGED_STEP:
+            if cost_new < cost:
+                R, t, cost = R_new, t_new, cost_new
+                damping *= 0.1
+                break
+            damping *= 10.0
+        if cost > (1.0 - _CONVERGED_DECREASE) * previous:
             break
     return R, t
 
 
-def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float) -> float:
-    """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises."""
-    distance = sampson_distance(correspondences, cross_matrix(t) @ R)
-    return float(np.sum(np.minimum(distance, threshold) ** 2))
+def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float, in_front: bool = False) -> float:
+    """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises.
+
+    With ``in_front`` a match that triangulates behind a camera counts as cut off.
+    """
+    distance = np.minimum(sampson_distance(correspondences, cross_matrix(t) @ R), threshold)
+    if in_front:
+        depth1, depth2 = triangulated_depths(correspondences, R, t)
+        distance = np.where((depth1 > 0) & (depth2 > 0), distance, threshold)
+    return float(np.sum(distance**2))
 
 
 def _tangent_basis(t: Array) -> Array:
@@ -77,7 +82,8 @@ def rotation_from_vector(vector: Array) -> Array:
     if angle < 1e-12:
         return np.eye(3) + cross_matrix(vector)
     k = cross_matrix(vector / angle)
-    return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+    R: Array = np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+    return R
 
 
 def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
@@ -88,19 +94,19 @@ def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
 
 def _residuals_and_jacobian(correspondences: Array, R: Array, t: Array) -> tuple[Array, Array]:
     """Signed Sampson distances (N,) and their derivatives (N, 5)."""
-    ones = np.ones((len(correspondences), 1))
-    x1 = np.hstack([correspondences[:, :2], ones])
-    x2 = np.hstack([correspondences[:, 2:], ones])
+    x1, x2 = homogeneous(correspondences[:, :2]), homogeneous(correspondences[:, 2:])
     T = cross_matrix(t)
     E = T @ R
-    dE = [T @ cross_matrix(axis) @ R for axis in np.eye(3)] + [cross_matrix(b) @ R for b in _tangent_basis(t)]
+    derivatives = np.stack(
+        [T @ cross_matrix(axis) @ R for axis in np.eye(3)] + [cross_matrix(b) @ R for b in _tangent_basis(t)]
+    )  # (5, 3, 3)
     line2, line1 = x1 @ E.T, x2 @ E
+    d_line2 = np.einsum("kij,nj->nki", derivatives, x1)  # (N, 5, 3)
+    d_line1 = np.einsum("kij,ni->nkj", derivatives[:, :, :2], x2)  # (N, 5, 2)
     error = np.sum(x2 * line2, axis=1)
-    scale = np.sqrt(np.maximum(np.sum(line2[:, :2] ** 2 + line1[:, :2] ** 2, axis=1), np.finfo(float).tiny))
-    jacobian = np.empty((len(x1), 5))
-    for k, derivative in enumerate(dE):
-        d_line2, d_line1 = x1 @ derivative.T, x2 @ derivative
-        d_error = np.sum(x2 * d_line2, axis=1)
-        d_scale = np.sum(line2[:, :2] * d_line2[:, :2] + line1[:, :2] * d_line1[:, :2], axis=1) / scale
-        jacobian[:, k] = (d_error - error * d_scale / scale) / scale
-    return error / scale, jacobian
+    squared_norm = np.sum(line2[:, :2] ** 2, axis=1) + np.sum(line1[:, :2] ** 2, axis=1)
+    scale = np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
+    d_error = np.einsum("ni,nki->nk", x2, d_line2)
+    d_scale = np.einsum("ni,nki->nk", line2[:, :2], d_line2[:, :, :2]) + np.einsum("ni,nki->nk", line1[:, :2], d_line1)
+    d_scale /= scale[:, None]
+    return error / scale, (d_error - (error / scale)[:, None] * d_scale) / scale[:, None]

@@ -1,4 +1,4 @@
-"""Robust fit of the two-view model to scored matches; the only place that calls OpenCV's or PoseLib's estimators.
+"""Robust fit of the two-view model to scored matches: with ``homography.py`` the only caller of OpenCV's estimators.
 
 All points are on the normalised image planes and thresholds come in pixels with the mean focal length that
 converts them. With intrinsics that can be trusted the model is an essential matrix; with guessed ones it is a
@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .epipolar import essential_from_pose, project_to_essential, sampson_distance
-from .pose_refinement import refine_pose
+from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, poses_from_homography, usac_params
+from .pose_refinement import refine_pose, truncated_cost
 
 Array = NDArray[np.float64]
 
 METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
 MIN_MATCHES = 8
-# With the following local optimisation UsacParams returns, at seed 0, the very bits of the USAC_PROSAC preset,
-# which alone cannot be seeded.
-_PROSAC_LO_ITERATIONS, _PROSAC_LO_SAMPLE_SIZE = 20, 12
+# A pose from the dominant plane is worth refining when it starts below this multiple of the cost to beat.
+RIVAL_COST_FACTOR = 1.5
 _POSELIB_MIN_ITERATIONS = 1000
 # recoverPose drops points farther than 50 baselines unless told otherwise.
 _ANY_DISTANCE = 1e9
@@ -39,7 +39,7 @@ class RobustFitOptions:
         confidence: probability that a sample without outliers was drawn.
         max_iterations: largest number of samples.
         seed: of the estimator's random numbers.
-        refine: finish with least squares on the pose.
+        refine: finish with least squares on the pose, from this model and from the dominant plane's.
         refine_threshold_px: where the refinement cuts the error off, pixels.
     """
 
@@ -119,10 +119,30 @@ def estimate_model(
     R, t = pose
     if calibrated:
         if options.refine:
-            R, t = refine_pose(rows, R, t, options.refine_threshold_px / focal_px)
+            R, t = _refine_best_start(rows, R, t, focal_px, options)
         E = essential_from_pose(R, t)
         M = E
     return TwoViewModel(M=M, E=E, R=R, t=t)
+
+
+def _refine_best_start(
+    rows: Array, R: Array, t: Array, focal_px: float, options: RobustFitOptions
+) -> tuple[Array, Array]:
+    """Refine the pose and its rivals from the dominant plane; keep the one of least truncated cost.
+
+    Where most matches lie on one plane two poses explain them about equally well, and sampling meets one of them
+    by chance. The few matches off the plane, and the depths, tell which is right.
+    """
+    threshold = options.refine_threshold_px / focal_px
+    R, t = refine_pose(rows, R, t, threshold)
+    near = rows[sampson_distance(rows, essential_from_pose(R, t)) < threshold]
+    H = fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, options.seed)
+    poses = [(R, t)]
+    limit = RIVAL_COST_FACTOR * truncated_cost(rows, R, t, threshold)
+    for start in [] if H is None else poses_from_homography(H):
+        if truncated_cost(rows, *start, threshold) < limit:
+            poses.append(refine_pose(rows, *start, threshold))
+    return poses[int(np.argmin([truncated_cost(rows, *pose, threshold, in_front=True) for pose in poses]))]
 
 
 def estimate_pose(
@@ -150,36 +170,10 @@ def pose_from_essential(E: Array, correspondences: Array) -> tuple[Array, Array]
     return np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
 
 
-def fit_homography(points1: Array, points2: Array, threshold_px: float, seed: int = 0) -> Array | None:
-    """Homography (3, 3) with ``p2 ~ H p1`` of pixels (N, 2), scaled to H[2, 2] = 1, or None."""
-    if len(points1) < 4:
-        return None
-    try:
-        params = _usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, threshold_px, 0.999, 2000, seed)
-        H, _ = cv2.findHomography(np.ascontiguousarray(points1), np.ascontiguousarray(points2), params)
-    except cv2.error:
-        return None
-    if H is None or not np.isfinite(H).all() or abs(H[2, 2]) < 1e-12:
-        return None
-    return np.asarray(H / H[2, 2], dtype=np.float64)
-
-
 def _first_of_equals(rows: Array) -> NDArray[np.intp]:
     """Positions of the distinct rows in their order: a match that is listed ten times supports a model once."""
     _, first = np.unique(rows, axis=0, return_index=True)
     return np.sort(first)
-
-
-def _usac_params(
-    sampler: int, score: int, threshold: float, confidence: float, max_iterations: int, seed: int
-) -> cv2.UsacParams:
-    params = cv2.UsacParams()
-    params.sampler, params.score = sampler, score
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    params.loIterations, params.loSampleSize = _PROSAC_LO_ITERATIONS, _PROSAC_LO_SAMPLE_SIZE
-    params.threshold, params.confidence = threshold, confidence
-    params.maxIterations, params.randomGeneratorState = max_iterations, seed % 2**31
-    return params
 
 
 def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Array | None:
@@ -191,16 +185,17 @@ def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibra
     x1, x2 = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
     try:
         if options.method == "ransac":
-            limits = {"maxIters": options.max_iterations}
             if calibrated:
                 M, _ = cv2.findEssentialMat(
-                    x1, x2, np.eye(3), method=cv2.RANSAC, prob=options.confidence, threshold=threshold, **limits
+                    x1, x2, np.eye(3), cv2.RANSAC, options.confidence, threshold, options.max_iterations
                 )
             else:
-                M, _ = cv2.findFundamentalMat(x1, x2, cv2.FM_RANSAC, threshold, options.confidence, **limits)
+                M, _ = cv2.findFundamentalMat(
+                    x1, x2, cv2.FM_RANSAC, threshold, options.confidence, options.max_iterations
+                )
         else:
             prosac = options.method == "prosac"
-            params = _usac_params(
+            params = usac_params(
                 cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM,
                 cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC,
                 threshold,

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from . import degeneracy
 from .epipolar import fundamental_from_essential, sampson_distance
+from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, homography_distance
 from .pair_input import PairInput
 from .result import Status
-from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model, fit_homography
+from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model
 
 Array = NDArray[np.float64]
 
@@ -31,7 +32,11 @@ class Verdict:
 
 
 def judge(
-    pair: PairInput, model: TwoViewModel | None, order: NDArray[np.intp], mask_threshold_px: float, options: RobustFitOptions
+    pair: PairInput,
+    model: TwoViewModel | None,
+    order: NDArray[np.intp],
+    mask_threshold_px: float,
+    options: RobustFitOptions,
 ) -> Verdict:
     """Re-test all matches against the model and decide what it is worth.
 
@@ -117,15 +122,13 @@ def _test_degenerate(
     K1, K2 = pair.intrinsics1.K, pair.intrinsics2.K
     R = degeneracy.fit_rotation(pair.correspondences[inlier_rows], threshold_px / pair.focal_px)
     H = K2 @ R @ np.linalg.inv(K1)
-    if degeneracy.explains(degeneracy.homography_distance(points1, points2, H), threshold_px, support):
+    if degeneracy.explains(homography_distance(points1, points2, H), threshold_px, support):
         mask = np.zeros(len(pair.valid), dtype=bool)
-        mask[pair.valid] = degeneracy.homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
+        mask[pair.valid] = homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
         info = {**verdict.info, "homography": H / H[2, 2]}
         return Verdict(Status.PURE_ROTATION, mask, R=R, info=info)
-    plane = fit_homography(points1, points2, degeneracy.EXPLAINED_THRESHOLD_FACTOR * threshold_px, options.seed)
-    if plane is not None and degeneracy.explains(
-        degeneracy.homography_distance(points1, points2, plane), threshold_px, support
-    ):
+    plane = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * threshold_px, options.seed)
+    if plane is not None and degeneracy.explains(homography_distance(points1, points2, plane), threshold_px, support):
         info = {**verdict.info, "homography": plane}
         if pair.calibrated:
             return replace(verdict, status=Status.PLANAR, info=info)

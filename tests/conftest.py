@@ -47,9 +47,7 @@ class Scene:
         ]
 
 
-def make_scene(
-    kind: str = "general", right: int = 120, wrong: int = 80, noise_px: float = 0.3, seed: int = 0
-) -> Scene:
+def make_scene(kind: str = "general", right: int = 120, wrong: int = 80, noise_px: float = 0.3, seed: int = 0) -> Scene:
     """A scene of ``kind`` general, planar, rotation or collinear, with wrong matches drawn at random."""
     rng = np.random.default_rng(seed)
     R = rotation_from_vector(np.array([0.05, -0.12, 0.03]))
@@ -66,7 +64,10 @@ def make_scene(
     pixels2 = X2[:, :2] / X2[:, 2:] * K[0, 0] + K[:2, 2]
     points1 = np.vstack([pixels, rng.uniform([0, 0], SIZE, (wrong, 2))])
     points2 = np.vstack([pixels2, rng.uniform([0, 0], SIZE, (wrong, 2))])
-    points1, points2 = points1 + rng.normal(0, noise_px, points1.shape), points2 + rng.normal(0, noise_px, points2.shape)
+    points1, points2 = (
+        points1 + rng.normal(0, noise_px, points1.shape),
+        points2 + rng.normal(0, noise_px, points2.shape),
+    )
     inlier = np.arange(right + wrong) < right
     ratio = np.where(inlier, rng.uniform(0.3, 0.85, len(inlier)), rng.uniform(0.7, 1.0, len(inlier)))
     rows = rng.permutation(len(inlier))
@@ -87,9 +88,7 @@ METADATA = {
     "calibration": json.dumps({"scale": 1.0, "offset": 0.0}),
     "decision_threshold": "0.0",
     "candidate_rule": json.dumps({"max_ratio": 0.95, "min_count": 32}),
-    "prior": json.dumps(
-        {"weight1": [[1.0, 0, 0, 0, 0, 0, 0, 0]], "bias1": [0.0], "weight2": [-8.0], "bias2": 3.0}
-    ),
+    "prior": json.dumps({"weight1": [[1.0, 0, 0, 0, 0, 0, 0, 0]], "bias1": [0.0], "weight2": [-8.0], "bias2": 3.0}),
     "license": "none",
     "minimum_onnxruntime": "1.17",
 }

@@ -16,10 +16,25 @@ from ..correspondences import ATTRIBUTE_COUNT
 from ..errors import ModelError
 
 CONTRACT_VERSION = "1"
+_TEXT_KEYS = (
+    "name",
+    "version",
+    "git_commit",
+    "training_data",
+    "detector",
+    "normalization",
+    "license",
+    "minimum_onnxruntime",
+)
 METADATA_KEYS = (
-    "contract_version name version git_commit training_data detector config normalization calibration "
-    "decision_threshold candidate_rule prior license minimum_onnxruntime"
-).split()
+    "contract_version",
+    *_TEXT_KEYS,
+    "config",
+    "calibration",
+    "decision_threshold",
+    "candidate_rule",
+    "prior",
+)
 
 
 @dataclass(frozen=True)
@@ -81,9 +96,8 @@ def parse_metadata(properties: Mapping[str, str], path: Path) -> ModelMetadata:
         prior = _parse_prior(json.loads(properties[key]))
     except (ValueError, TypeError, KeyError) as error:
         raise ModelError(f"{path}: metadata '{key}' cannot be read ({type(error).__name__}: {error})") from error
-    text = "name version git_commit training_data detector normalization license minimum_onnxruntime".split()
     return ModelMetadata(
-        **{field: properties[field] for field in text},
+        **{field: properties[field] for field in _TEXT_KEYS},
         config=config,
         calibration=Calibration(scale, offset),
         decision_threshold=threshold,
