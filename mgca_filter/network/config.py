@@ -1,0 +1,88 @@
+"""The one description of a network: what is built, trained, exported and written into model files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, fields
+from typing import Literal
+
+ATTRIBUTE_CHANNELS = 8
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Size and switches of an MGCA-Net; frozen, because weights fit one config only.
+
+    Attributes:
+        channels: width C of every feature map; a multiple of 4.
+        clusters: nodes of the order-aware block.
+        stages: iterations of the network, each with its own weights (the paper's "Iter" switch).
+        neighbours: k of the graph block, a multiple of 3 (annular convolution eats three at a time).
+        attention: CPA as in the published code ("channel", C x C, linear in N) or the text ("point", N x N).
+        positional: the positional term of CPA.
+        cga: context graph attention; replaced by the identity when False (the paper's ablation).
+        csmgc: cross-stage multi-graph consensus between stages (the paper's ablation).
+        final_consensus: consensus over the outputs of all stages, whose heads give the answer.
+        pooled_branches: the average- and max-pooled branches of MB-FFN.
+        squeeze_excitation: channel gates of the consensus blocks.
+        attributes: side information of the matches as input and as a prior on the logits.
+    """
+
+    channels: int = 64
+    clusters: int = 128
+    stages: int = 2
+    neighbours: int = 6
+    attention: Literal["channel", "point"] = "channel"
+    positional: bool = True
+    cga: bool = True
+    csmgc: bool = True
+    final_consensus: bool = True
+    pooled_branches: bool = True
+    squeeze_excitation: bool = True
+    attributes: bool = True
+
+    def __post_init__(self) -> None:
+        if self.channels < 4 or self.channels % 4:
+            raise ValueError(f"channels must be a positive multiple of 4, not {self.channels}")
+        if self.neighbours < 3 or self.neighbours % 3:
+            raise ValueError(f"neighbours must be a positive multiple of 3, not {self.neighbours}")
+        if self.stages not in (1, 2, 3):
+            raise ValueError(f"stages must be 1, 2 or 3, not {self.stages}")
+        if self.clusters < 1:
+            raise ValueError(f"clusters must be positive, not {self.clusters}")
+        if self.attention not in ("channel", "point"):
+            raise ValueError(f"attention must be 'channel' or 'point', not {self.attention!r}")
+
+    def to_json(self) -> str:
+        """All fields as a JSON object."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str) -> NetworkConfig:
+        """Inverse of :meth:`to_json`.
+
+        Raises:
+            ValueError: the text is no JSON object or names a field that is not there.
+        """
+        values = json.loads(text)
+        return cls.from_dict(values)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, object]) -> NetworkConfig:
+        """A config from field names and values; ``preset`` names what the others are changes to.
+
+        Raises:
+            ValueError: a field is not there.
+        """
+        values = dict(values)
+        base = PRESETS[str(values.pop("preset"))] if "preset" in values else cls()
+        unknown = set(values) - {field.name for field in fields(cls)}
+        if unknown:
+            raise ValueError(f"unknown network option: {', '.join(sorted(unknown))}")
+        return cls(**{**asdict(base), **values})  # type: ignore[arg-type]
+
+
+PRESETS = {
+    "small": NetworkConfig(),
+    "paper": NetworkConfig(channels=128, clusters=500, stages=3),
+}

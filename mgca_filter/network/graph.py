@@ -1,0 +1,146 @@
+"""Graphs over the nearest neighbours in feature space, convolved per match instead of per edge.
+
+An edge holds [x_i, x_i − x_j]. A linear map of it is W_c x_i − W_n x_j with W_c the sum of both halves, so
+that maps of edges become maps of matches followed by a gather: the products shrink by the factor k.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from .point_cn import ChannelBatchNorm, ContextNorm, LinearNorm
+
+RING = 3  # neighbours that one annular kernel covers
+_FAR = 1e30
+
+
+def nearest_neighbours(features: Tensor, k: int) -> Tensor:
+    """Indices (B, N, k) of the nearest matches in feature space (B, N, C), nearest first.
+
+    The match itself is one of them. Where there are fewer than k matches the match itself fills the rest:
+    k padding keys that are never near stand behind the real ones, so that k is a constant of the graph.
+    """
+    x = features.detach().float()
+    x = x - x.mean(1, keepdim=True)  # distances survive, cancellation does not
+    count = x.shape[1]
+    # Per row i, the order of |x_i − x_j|² is that of |x_j|²/2 − x_i·x_j.
+    penalty = F.pad(0.5 * x.square().sum(-1, keepdim=True), (0, 0, 0, k), value=_FAR)
+    keys = torch.cat([F.pad(x, (0, 0, 0, k)), -penalty], -1)  # (B, N + k, C + 1)
+    queries = torch.cat([x, torch.ones_like(x[..., :1])], -1)
+    nearness = queries @ keys.transpose(1, 2)  # (B, N, N + k)
+    indices = nearness.topk(k, dim=-1).indices
+    own = torch.arange(count, device=x.device).view(1, -1, 1)
+    return torch.where(indices < count, indices, own)
+
+
+def gather_rows(rows: Tensor, indices: Tensor) -> Tensor:
+    """Rows (B, M, C) at indices (B, ...) → (B, ..., C)."""
+    batch, count, channels = rows.shape
+    start = torch.arange(batch, device=rows.device).view([batch] + [1] * (indices.dim() - 1)) * count
+    return F.embedding(indices + start, rows.reshape(-1, channels))
+
+
+class AnnularConvolution(nn.Module):
+    """Annular convolution over the sorted neighbours of one or several graphs.
+
+    The columns of all graphs — neighbours by rising distance, one graph after the other — are cut into rings
+    of three; a 1x3 kernel with stride 3 maps each ring (BN, ReLU), a 1xR kernel joins the R rings (BN, ReLU).
+
+    Args:
+        channels: width of the graphs' features; an edge has twice as many.
+        outputs: width of the result.
+        graphs: number of graphs.
+        k: neighbours taken of each graph; ``graphs * k`` must be a multiple of 3.
+    """
+
+    def __init__(self, channels: int, outputs: int, graphs: int, k: int) -> None:
+        super().__init__()
+        if graphs * k % RING:
+            raise ValueError(f"{graphs} graphs of {k} neighbours do not fill rings of {RING}")
+        columns = [(graph, rank) for graph in range(graphs) for rank in range(k)]
+        # Of each ring: {graph: [(rank of the neighbour, position in the kernel), ...]}
+        self.rings: list[dict[int, list[tuple[int, int]]]] = []
+        for first in range(0, len(columns), RING):
+            ring: dict[int, list[tuple[int, int]]] = {}
+            for position, (graph, rank) in enumerate(columns[first : first + RING]):
+                ring.setdefault(graph, []).append((rank, position))
+            self.rings.append(ring)
+        self.outputs = outputs
+        bound = (2 * RING * channels) ** -0.5
+        self.centre = nn.Parameter(torch.empty(RING, channels, outputs).uniform_(-bound, bound))
+        self.neighbour = nn.Parameter(torch.empty(RING, channels, outputs).uniform_(-bound, bound))
+        self.ring_norm = ChannelBatchNorm(outputs)
+        self.join = LinearNorm(len(self.rings) * outputs, outputs)
+
+    def forward(self, maps: Sequence[Tensor], indices: Sequence[Tensor]) -> Tensor:
+        """Features (B, N, channels) and neighbours (B, N, k), one of each per graph → (B, N, outputs)."""
+        kernel = self.neighbour.permute(1, 0, 2).flatten(1)  # (channels, 3 * outputs)
+        # Row 3 j + p is what neighbour j contributes at position p of a ring.
+        rows = [(x @ kernel).reshape(x.shape[0], -1, self.outputs) for x in maps]
+        centres: dict[tuple[int, tuple[int, ...]], Tensor] = {}
+        rings = []
+        for ring in self.rings:
+            terms = []
+            for graph, taken in ring.items():
+                ranks, positions = zip(*taken, strict=True)
+                if (graph, positions) not in centres:
+                    centres[graph, positions] = maps[graph] @ self.centre[list(positions)].sum(0)
+                offsets = torch.tensor(positions, device=maps[graph].device)
+                picked = indices[graph][..., ranks[0] : ranks[-1] + 1] * RING + offsets
+                terms.append(centres[graph, positions] - gather_rows(rows[graph], picked).sum(2))
+            rings.append(sum(terms[1:], terms[0]))
+        ringed = F.relu(self.ring_norm(torch.stack(rings, 2)))  # (B, N, R, outputs)
+        return F.relu(self.join(ringed.flatten(2)))
+
+
+class EdgeMaximum(nn.Module):
+    """Context norm → BN → ReLU → 1x1 conv of each edge, then the maximum over the neighbours."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.centre_norm = ContextNorm(channels)
+        self.difference_norm = ContextNorm(channels, dims=(1, 2))
+        self.centre = nn.Linear(channels, channels)
+        self.difference = nn.Linear(channels, channels, bias=False)
+
+    def forward(self, x: Tensor, indices: Tensor) -> Tensor:
+        difference = x.unsqueeze(2) - gather_rows(x, indices)  # (B, N, k, C)
+        edges = self.difference(F.relu(self.difference_norm(difference)))
+        return self.centre(F.relu(self.centre_norm(x))) + edges.amax(2)
+
+
+class AttentionalFusion(nn.Module):
+    """Gate between two feature maps: 2 a w + 2 b (1 − w), w = sigmoid(local(a + b) + global(a + b))."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        hidden = channels // 4
+        self.local = nn.Sequential(LinearNorm(channels, hidden), nn.ReLU(), LinearNorm(hidden, channels))
+        # One vector per pair is too little for batch statistics: LayerNorm instead.
+        self.pooled = nn.Sequential(
+            nn.Linear(channels, hidden), nn.LayerNorm(hidden), nn.ReLU(), nn.Linear(hidden, channels)
+        )
+
+    def forward(self, a: Tensor, b: Tensor) -> Tensor:
+        both = a + b
+        w = torch.sigmoid(self.local(both) + self.pooled(both.mean(1, keepdim=True)))
+        return 2.0 * (a * w + b * (1.0 - w))
+
+
+class GraphBlock(nn.Module):
+    """GNN block: annular convolution and edge maximum over k neighbours, joined by attentional fusion."""
+
+    def __init__(self, channels: int, k: int) -> None:
+        super().__init__()
+        self.k = k
+        self.annular = AnnularConvolution(channels, channels, graphs=1, k=k)
+        self.maximum = EdgeMaximum(channels)
+        self.fusion = AttentionalFusion(channels)
+
+    def forward(self, x: Tensor) -> Tensor:
+        indices = nearest_neighbours(x, self.k)  # (B, N, k)
+        return self.fusion(self.annular([x], [indices]), self.maximum(x, indices))

@@ -1,0 +1,81 @@
+"""``python -m mgca_filter.training --config FILE --data FOLDER --run FOLDER``"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from ..errors import MgcaFilterError
+from ..scene_bundle import SceneBundle, load_scene_bundles
+from .config import ConfigError, TrainingConfig, load_config
+from .datasets import SceneBundleDataset
+from .loop import DivergedError, Trainer
+from .validation import quick_validation, select_pairs
+
+
+def split_scenes(bundles: Sequence[SceneBundle], config: TrainingConfig) -> tuple[list[SceneBundle], list[SceneBundle]]:
+    """Training and tuning bundles.
+
+    Raises:
+        ConfigError: a tuning scene is not among the bundles.
+    """
+    names = {bundle.scene for bundle in bundles}
+    missing = [scene for scene in config.tuning_scenes if scene not in names]
+    if missing:
+        raise ConfigError(f"tuning_scenes: not in the data folder: {', '.join(missing)}")
+    tuning = [bundle for bundle in bundles if bundle.scene in config.tuning_scenes]
+    return [bundle for bundle in bundles if bundle.scene not in config.tuning_scenes], tuning
+
+
+def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="python -m mgca_filter.training", description="Train MGCA-Net.")
+    parser.add_argument("--config", type=Path, required=True, help="TOML file, e.g. mgca_filter/training/configs/small.toml")
+    parser.add_argument("--data", type=Path, required=True, help="folder of scene bundles (.npz)")
+    parser.add_argument("--run", type=Path, required=True, help="run directory; a checkpoint in it is resumed")
+    parser.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
+    parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--workers", type=int, default=1, help="processes that prepare batches (0 = none)")
+    parser.add_argument("--stop-after", type=int, help="stop after this many steps; resume by the same command")
+    parser.add_argument("--validate-every", type=int, default=500, metavar="STEPS")
+    parser.add_argument("--validate-pairs", type=int, default=12, metavar="N", help="pairs of each tuning scene")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 = done, 1 = diverged, 2 = config or data cannot be used."""
+    options = parse_arguments(arguments)
+    try:
+        config = load_config(options.config)
+        training, tuning = split_scenes(load_scene_bundles(options.data), config)
+        dataset = SceneBundleDataset(
+            training, config.sampling, config.augmentation, config.seed, config.schedule.steps
+        )
+        validate = partial(quick_validation, pairs=select_pairs(tuning or training, options.validate_pairs))
+        trainer = Trainer(
+            config,
+            dataset,
+            options.run,
+            validate,
+            options.validate_every,
+            options.device,
+            options.workers,
+            options.init,
+        )
+        trainer.run(options.stop_after)
+    except (ConfigError, MgcaFilterError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except DivergedError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

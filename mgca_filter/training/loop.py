@@ -1,0 +1,188 @@
+"""The training loop: one step is one batch; what happens beside it happens on a schedule of steps."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+from tqdm import tqdm
+
+from ..network import MGCANet, load_network, save_network
+from .checkpoint import restore_checkpoint, save_checkpoint
+from .config import ScheduleConfig, TrainingConfig
+from .datasets import SceneBundleDataset
+from .loss import balanced_cross_entropy, network_loss, precision_recall
+
+LOG_EVERY = 20
+SAVE_EVERY = 200
+CHECKPOINT, WEIGHTS, LOG, VALIDATION = "checkpoint.pt", "weights.safetensors", "train.csv", "validation.csv"
+
+Validation = Callable[[MGCANet], dict[str, float]]
+
+
+class DivergedError(RuntimeError):
+    """The loss is no longer a number; the batch that did it was saved."""
+
+
+def learning_rate(schedule: ScheduleConfig, step: int) -> float:
+    """Learning rate of a step: linear warm-up, then a cosine down to a fraction of the peak."""
+    if step < schedule.warmup_steps:
+        return schedule.learning_rate * (step + 1) / schedule.warmup_steps
+    progress = (step - schedule.warmup_steps) / max(schedule.steps - schedule.warmup_steps, 1)
+    cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
+    return schedule.learning_rate * (schedule.final_fraction + (1.0 - schedule.final_fraction) * cosine)
+
+
+class Trainer:
+    """One run in one directory: ``config.json``, ``checkpoint.pt``, ``train.csv``, ``validation.csv`` and
+    ``weights.safetensors``, the averaged weights after the last save.
+
+    Args:
+        config: the run.
+        dataset: batches by step.
+        folder: run directory; a checkpoint in it is resumed.
+        validate: figures of a network, every ``validate_every`` steps and at the end.
+        device: torch device.
+        workers: processes that prepare batches; 0 prepares them in this one.
+        initial_weights: weights to start from, of the same network.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        dataset: SceneBundleDataset,
+        folder: Path,
+        validate: Validation,
+        validate_every: int = 500,
+        device: str = "cpu",
+        workers: int = 1,
+        initial_weights: Path | None = None,
+    ) -> None:
+        self.config, self.dataset, self.folder = config, dataset, folder
+        self.validate, self.validate_every = validate, validate_every
+        self.device, self.workers = torch.device(device), workers
+        torch.manual_seed(config.seed)
+        self.network = MGCANet(config.network)
+        if initial_weights is not None:
+            self.network.load_state_dict(load_network(initial_weights).state_dict())
+        self.network.to(self.device)
+        self.average = deepcopy(self.network).requires_grad_(False)
+        self.optimizer = _optimizer(self.network, config.schedule)
+        folder.mkdir(parents=True, exist_ok=True)
+        self.step = 0
+        if (folder / CHECKPOINT).is_file():
+            self.step = restore_checkpoint(folder / CHECKPOINT, config, self.network, self.average, self.optimizer)
+        for name in (LOG, VALIDATION):
+            _drop_rows_after(folder / name, self.step)
+        (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
+
+    def run(self, stop_after: int | None = None) -> None:
+        """Train to the end of the schedule, or for ``stop_after`` steps."""
+        last = self.config.schedule.steps
+        if stop_after is not None:
+            last = min(last, self.step + stop_after)
+        loader = DataLoader(
+            self.dataset,
+            batch_size=None,
+            sampler=range(self.step, last),
+            num_workers=self.workers,
+            prefetch_factor=4 if self.workers else None,
+        )
+        with tqdm(total=self.config.schedule.steps, initial=self.step, unit="step", smoothing=0.05) as progress:
+            clock = time.perf_counter()
+            for batch in loader:
+                figures = self._train_step({name: tensor.to(self.device) for name, tensor in batch.items()})
+                self.step += 1
+                progress.update()
+                if self.step % LOG_EVERY == 0:
+                    seconds, clock = time.perf_counter() - clock, time.perf_counter()
+                    figures["samples_per_s"] = LOG_EVERY * self.config.sampling.batch_size / seconds
+                    _append_row(self.folder / LOG, {"step": self.step, **figures})
+                    progress.set_postfix(loss=f"{figures['loss']:.3f}", recall=f"{figures['recall']:.2f}")
+                if self.step % self.validate_every == 0 or self.step == self.config.schedule.steps:
+                    _append_row(self.folder / VALIDATION, {"step": self.step, **self.validate(self.average)})
+                if self.step % SAVE_EVERY == 0 or self.step == last:
+                    self.save()
+
+    def save(self) -> None:
+        """Write checkpoint and averaged weights."""
+        save_checkpoint(
+            self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer
+        )
+        save_network(self.average, self.folder / WEIGHTS, {"name": self.config.name, "steps": str(self.step)})
+
+    def _train_step(self, batch: dict[str, Tensor]) -> dict[str, float]:
+        schedule = self.config.schedule
+        rate = learning_rate(schedule, self.step)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        if not torch.isfinite(batch["correspondences"]).all():  # one NaN would poison the running statistics
+            self._stop(batch, "the input holds NaN")
+        geometric = schedule.geometric_weight if self.step >= schedule.geometric_from * schedule.steps else 0.0
+        self.network.train()
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=schedule.precision == "bf16"):
+            output = self.network(batch["correspondences"], batch["attributes"])
+        loss, parts = network_loss(output, batch, geometric)
+        if self.network.prior is not None:
+            prior = self.network.prior(batch["prior_attributes"])
+            loss = loss + schedule.prior_weight * balanced_cross_entropy(prior, batch["prior_labels"])
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        norm = nn.utils.clip_grad_norm_(self.network.parameters(), schedule.clip_norm)
+        if not (torch.isfinite(loss) and torch.isfinite(norm)):
+            self._stop(batch, "loss or gradient is not finite")
+        self.optimizer.step()
+        self._update_average()
+        if (self.step + 1) % LOG_EVERY:
+            return {}
+        precision, recall = precision_recall(output.logits, batch["labels"])
+        figures = {"loss": loss, **parts, "precision": precision, "recall": recall, "gradient_norm": norm}
+        return {name: float(value) for name, value in figures.items()} | {"learning_rate": rate}
+
+    @torch.no_grad()
+    def _update_average(self) -> None:
+        decay = min(self.config.schedule.ema_decay, (1.0 + self.step) / (10.0 + self.step))
+        for mine, new in zip(self.average.state_dict().values(), self.network.state_dict().values(), strict=True):
+            if mine.dtype.is_floating_point:
+                mine.lerp_(new, 1.0 - decay)
+            else:
+                mine.copy_(new)
+
+    def _stop(self, batch: dict[str, Tensor], reason: str) -> None:
+        path = self.folder / f"diverged_{self.step}.pt"
+        torch.save(batch, path)
+        raise DivergedError(f"step {self.step}: {reason}; the batch lies in {path}")
+
+
+def _optimizer(network: nn.Module, schedule: ScheduleConfig) -> torch.optim.Optimizer:
+    matrices = [p for p in network.parameters() if p.dim() > 1]
+    vectors = [p for p in network.parameters() if p.dim() <= 1]
+    groups = [{"params": matrices, "weight_decay": schedule.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
+    return torch.optim.AdamW(groups, lr=schedule.learning_rate)
+
+
+def _append_row(path: Path, row: dict[str, Any]) -> None:
+    new = not path.is_file()
+    with open(path, "a", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(row))
+        if new:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def _drop_rows_after(path: Path, step: int) -> None:
+    """Forget what a killed run logged beyond its last checkpoint."""
+    if not path.is_file():
+        return
+    header, *rows = path.read_text(encoding="utf-8").splitlines()
+    kept = [row for row in rows if int(row.split(",", 1)[0]) <= step]
+    path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")

@@ -1,0 +1,57 @@
+"""What training minimises: classification of every match and geometry of every essential matrix."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from ..network import NetworkOutput
+from ..network.eight_point import symmetric_epipolar_distance_squared
+from .labels import NEGATIVE, POSITIVE
+
+GEOMETRIC_CLAMP = 0.1
+
+
+def balanced_cross_entropy(logits: Tensor, labels: Tensor) -> Tensor:
+    """Cross-entropy in which right and wrong matches weigh one half each, per pair; mean over pairs.
+
+    ``logits`` and ``labels`` (B, N); labels 1, 0, −1 = left out. A pair without right (wrong) matches
+    contributes its other half alone.
+    """
+    positive, negative = (labels == POSITIVE).float(), (labels == NEGATIVE).float()
+    loss_positive = (F.softplus(-logits) * positive).sum(1) / positive.sum(1).clamp_min(1.0)
+    loss_negative = (F.softplus(logits) * negative).sum(1) / negative.sum(1).clamp_min(1.0)
+    return 0.5 * (loss_positive + loss_negative).mean()
+
+
+def geometric_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
+    """Mean distance of virtual points (B, V, 4) on the true geometry to predicted E (B, 3, 3), clamped at 0.1.
+
+    Squared symmetric epipolar distance; pairs with ``valid`` (B,) 0 don't count.
+    """
+    distance = symmetric_epipolar_distance_squared(virtual, essential).clamp_max(GEOMETRIC_CLAMP)
+    return (distance.mean(1) * valid).sum() / valid.sum().clamp_min(1.0)
+
+
+def network_loss(
+    output: NetworkOutput, batch: dict[str, Tensor], geometric_weight: float
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Loss summed over all heads, and its parts (of the last head) for the log."""
+    total = output.logits.new_zeros(())
+    for head in output.heads:
+        classification = balanced_cross_entropy(head.logits, batch["labels"])
+        geometry = geometric_loss(head.essential, batch["virtual"], batch["virtual_valid"])
+        total = total + classification
+        if geometric_weight > 0:
+            total = total + geometric_weight * geometry
+    return total, {"classification": classification.detach(), "geometric": geometry.detach()}
+
+
+def precision_recall(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean precision and recall over pairs at logit > 0, of the matches that have a label."""
+    kept = (logits > 0) & (labels >= 0)
+    right = (kept & (labels == POSITIVE)).sum(1).float()
+    precision = right / kept.sum(1).clamp_min(1)
+    recall = right / (labels == POSITIVE).sum(1).clamp_min(1)
+    return precision.mean(), recall.mean()
