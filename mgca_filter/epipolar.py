@@ -27,7 +27,7 @@ def essential_from_pose(R: ArrayLike, t: ArrayLike) -> FloatArray:
 
 def fundamental_from_essential(E: ArrayLike, K1: ArrayLike, K2: ArrayLike) -> FloatArray:
     """F (3, 3) for pixels, of unit Frobenius norm, from E and the intrinsics of both images."""
-    F = np.linalg.inv(np.asarray(K2, float)).T @ np.asarray(E, float) @ np.linalg.inv(np.asarray(K1, float))
+    F: FloatArray = np.linalg.inv(np.asarray(K2, float)).T @ np.asarray(E, float) @ np.linalg.inv(np.asarray(K1, float))
     return F / np.linalg.norm(F)
 
 

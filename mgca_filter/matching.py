@@ -145,7 +145,8 @@ def distance_ratio(nearest: NDArray[np.float64], second: NDArray[np.float64]) ->
     """
     known = np.isfinite(nearest) & np.isfinite(second)
     ambiguous = known & (second <= 0)
-    ratio = np.divide(nearest, second, out=np.full(len(nearest), np.nan), where=known & ~ambiguous)
+    with np.errstate(over="ignore"):
+        ratio = np.divide(nearest, second, out=np.full(len(nearest), np.nan), where=known & ~ambiguous)
     return np.where(ambiguous, 1.0, np.clip(ratio, 0.0, 1.0)).astype(np.float32)
 
 
