@@ -1,0 +1,196 @@
+"""Runs methods over pairs, in worker processes if wanted, and keeps every result as it comes."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
+from ..scene_bundle import SceneBundle, ScenePair
+from .environment import CpuMeter, processor_name
+from .methods import Answer, Method, PairOutcome
+from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
+from .pairs import SceneSelection
+from .store import ResultKey, ResultStore
+
+logger = logging.getLogger(__name__)
+
+CHUNK_PAIRS = 40
+"""Pairs between two writes to the store: what an interrupted run loses at most, per worker."""
+
+_warm_methods: set[str] = set()
+
+SceneOutcomes = dict[str, list[list[PairOutcome]]]
+"""Outcomes by scene: one list per seed, each in the order of the pairs."""
+
+
+@dataclass(frozen=True)
+class _Task:
+    method: Method
+    key: ResultKey
+    path: Path
+    indices: tuple[int, ...]
+
+
+def predict(
+    methods: Sequence[Method],
+    selections: Sequence[SceneSelection],
+    *,
+    seeds: int = 3,
+    workers: int = 1,
+    store: ResultStore | None = None,
+) -> dict[str, SceneOutcomes]:
+    """Outcomes of every method on every chosen pair, by name of the method and scene.
+
+    Results do not depend on ``workers``; times do. What the store knows already is not run again.
+
+    Args:
+        methods: rows to run; names must differ.
+        selections: pairs to run them on.
+        seeds: number of runs, seeds 0 … seeds − 1, of the methods whose ``seeded`` is True; the others run once.
+        workers: processes; 1 runs everything in this one.
+        store: where results are looked up and kept; None keeps them in memory.
+
+    Raises:
+        BundleError: a pair of a bundle is broken. What a method raises counts as a failure of the pair instead.
+        ValueError: ``seeds`` or ``workers`` is below 1, or two methods share a name.
+    """
+    if seeds < 1 or workers < 1:
+        raise ValueError(f"seeds and workers must be at least 1, got {seeds} and {workers}")
+    if len({method.name for method in methods}) < len(methods):
+        raise ValueError("two methods have the same name")
+    store = ResultStore(None) if store is None else store
+    keys = _result_keys(methods, selections, seeds)
+    tasks = list(_missing_tasks(methods, selections, keys, store))
+    total = sum(len(task.indices) for task in tasks)
+    logger.info("%d pairs to run, %d tasks", total, len(tasks))
+    done = 0
+    for task, outcomes in _run_tasks(tasks, workers):
+        store.add(task.key, outcomes)
+        done += len(outcomes)
+        logger.info("%d/%d  %s, %s, seed %d", done, total, task.key.method, task.key.scene, task.key.seed)
+    results: dict[str, SceneOutcomes] = {}
+    for method in methods:
+        results[method.name] = {}
+        for selection in selections:
+            runs = [store.load(key) for key in keys[method.name, selection.scene]]
+            results[method.name][selection.scene] = [[run[index] for index in selection.indices] for run in runs]
+    return results
+
+
+def _result_keys(
+    methods: Sequence[Method], selections: Sequence[SceneSelection], seeds: int
+) -> dict[tuple[str, str], list[ResultKey]]:
+    """Keys by method and scene, one per seed."""
+    keys = {}
+    for method in methods:
+        settings = method.settings()
+        for selection in selections:
+            keys[method.name, selection.scene] = [
+                ResultKey(method.name, selection.scene, seed, selection.sha256, settings)
+                for seed in range(seeds if method.seeded else 1)
+            ]
+    return keys
+
+
+def _missing_tasks(
+    methods: Sequence[Method],
+    selections: Sequence[SceneSelection],
+    keys: dict[tuple[str, str], list[ResultKey]],
+    store: ResultStore,
+) -> Iterator[_Task]:
+    for method in methods:
+        for selection in selections:
+            for key in keys[method.name, selection.scene]:
+                known = store.load(key)
+                missing = [index for index in selection.indices if index not in known]
+                for first in range(0, len(missing), CHUNK_PAIRS):
+                    yield _Task(method, key, selection.path, tuple(missing[first : first + CHUNK_PAIRS]))
+
+
+def _run_tasks(tasks: list[_Task], workers: int) -> Iterator[tuple[_Task, list[PairOutcome]]]:
+    if workers == 1 or len(tasks) < 2:
+        threads = cv2.getNumThreads()
+        try:
+            for task in tasks:
+                yield task, _run_task(task)
+        finally:
+            cv2.setNumThreads(threads)
+        return
+    # Fresh interpreters: ONNX Runtime's and OpenCV's threads do not survive a fork.
+    with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(_run_task, task): task for task in tasks}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+@lru_cache(maxsize=2)
+def _bundle(path: Path, modified_ns: int) -> SceneBundle:
+    return SceneBundle(path)
+
+
+def _warm_up(method: Method, pair: ScenePair) -> None:
+    """Once per process and method, untimed: sessions are opened and buffers allocated outside the measurement."""
+    if repr(method) not in _warm_methods:
+        _answer(method, pair, 0)
+        _warm_methods.add(repr(method))
+
+
+def _run_task(task: _Task) -> list[PairOutcome]:
+    cv2.setNumThreads(1)
+    bundle = _bundle(task.path, task.path.stat().st_mtime_ns)
+    _warm_up(task.method, bundle[task.indices[0]])
+    meter = CpuMeter()
+    measured = [evaluate_pair(task.method, bundle[index], task.key.seed) for index in task.indices]
+    busy, machine = meter.others_were_busy(), processor_name()
+    return [replace(outcome, busy=busy, machine=machine) for outcome in measured]
+
+
+def _answer(method: Method, pair: ScenePair, seed: int) -> Answer:
+    """The method's answer; what it raises becomes a failure, since a user's pair would be lost just the same."""
+    try:
+        return method.run(pair, seed)
+    except Exception as error:
+        nothing = np.zeros(len(pair.points1), dtype=bool)
+        return Answer(None, None, nothing, nothing, f"error: {type(error).__name__}: {error}")
+
+
+def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
+    """Run a method on one pair, time it and compare its answer with the truth."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    answer = _answer(method, pair, seed)
+    elapsed_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
+    truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
+    rotation_deg = translation_deg = None
+    error_deg = FAILURE_DEG
+    failure = answer.failure
+    if answer.R is not None and answer.t is not None:
+        rotation_deg = rotation_error_deg(answer.R, pair.R)
+        translation_deg = translation_error_deg(answer.t, pair.t)
+        error_deg = max(rotation_deg, translation_deg)
+    elif not failure:
+        failure = "no pose"
+    return PairOutcome(
+        pair=pair.index,
+        error_deg=error_deg,
+        rotation_deg=rotation_deg,
+        translation_deg=translation_deg,
+        kept=precision_recall_f(answer.kept, truth),
+        mask=precision_recall_f(answer.mask, truth),
+        elapsed_ms=elapsed_ms,
+        cpu_ms=cpu_ms,
+        failure=failure,
+    )

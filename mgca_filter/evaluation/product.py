@@ -1,0 +1,160 @@
+"""The filter's own rows, run through the public door as users call it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correspondences import MatchAttributes, normalize_points
+from ..result import FilterResult
+from ..scene_bundle import ScenePair
+from .baselines import REVISION, pose_from_essential
+from .methods import MIN_MATCHES, Answer, FloatArray, PoseEstimate, Selection
+
+VARIANTS = {
+    "product": "filter_matches, default options, with attributes, intrinsics and image sizes",
+    "product poselib": "the same with method='poselib'",
+    "product bare": "the same as product without attributes: positions only",
+    "network E": "recoverPose on the network's own E with the 10 % best-scored matches, no RANSAC",
+    "network RANSAC": "findEssentialMat(RANSAC, 1e-3 normalised) on the matches of logit > 0, the papers' protocol",
+}
+"""Names of the rows and what they run."""
+
+BEST_SHARE = 0.1
+PAPER_THRESHOLD_NORM = 1e-3
+
+
+@dataclass(frozen=True)
+class ProductMethod:
+    """One of :data:`VARIANTS` on the matches that ``selection`` leaves (all of them by default)."""
+
+    variant: str
+    selection: Selection = Selection()
+    model: str | None = None
+
+    @property
+    def name(self) -> str:
+        return " + ".join([*self.selection.parts, self.variant])
+
+    @property
+    def seeded(self) -> bool:
+        """PoseLib rows are averaged over the same seeds as the rivals'; the others run once, as OpenCV's do."""
+        return self.variant == "product poselib"
+
+    def settings(self) -> dict[str, Any]:
+        import onnxruntime
+
+        from mgca_filter import MatchFilter, model_path
+
+        # Opened here once, so that a model that cannot be used stops the run instead of failing every pair.
+        MatchFilter(**self._options(seed=0))
+        path = Path(model_path() if self.model is None else self.model)
+        settings = {
+            "revision": REVISION,
+            "variant": self.variant,
+            "selection": asdict(self.selection),
+            "model": path.name,
+            "model_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "source_sha256": runtime_source_digest(),
+            "opencv": cv2.__version__,
+            "onnxruntime": onnxruntime.__version__,
+        }
+        if self.variant == "product poselib":
+            import poselib
+
+            settings["poselib"] = poselib.__version__
+        return settings
+
+    def run(self, pair: ScenePair, seed: int) -> Answer:
+        kept = self.selection.apply(pair)
+        rows = np.flatnonzero(kept)
+        result = self._filter(pair, rows, seed)
+        logits = np.asarray(result.info["logits"], dtype=np.float64)
+        if self.variant.startswith("product"):
+            estimate = _pose_of_result(result)
+        else:
+            x1 = normalize_points(pair.points1[rows], pair.K1)
+            x2 = normalize_points(pair.points2[rows], pair.K2)
+            if self.variant == "network E":
+                estimate = pose_without_ransac(result.info.get("network_essential"), logits, x1, x2)
+            else:
+                estimate = pose_by_paper_protocol(logits, x1, x2)
+        kept[rows] = logits > 0
+        mask = np.zeros(len(kept), dtype=bool)
+        mask[rows] = estimate.inliers
+        return Answer(estimate.R, estimate.t, kept, mask, estimate.failure)
+
+    def _filter(self, pair: ScenePair, rows: NDArray[np.intp], seed: int) -> FilterResult:
+        from mgca_filter import filter_matches
+
+        attributes: MatchAttributes | None = None if self.variant == "product bare" else pair.attributes.take(rows)
+        return filter_matches(
+            pair.points1[rows],
+            pair.points2[rows],
+            None,
+            K1=pair.K1,
+            K2=pair.K2,
+            size1=pair.image_size1,
+            size2=pair.image_size2,
+            attributes=attributes,
+            **self._options(seed),
+        )
+
+    def _options(self, seed: int) -> dict[str, Any]:
+        """What differs from the defaults of ``filter_matches``."""
+        options: dict[str, Any] = {} if self.model is None else {"model": self.model}
+        if self.variant == "product poselib":
+            options |= {"method": "poselib", "seed": seed}
+        elif self.variant.startswith("network"):
+            options["method"] = "none"
+        return options
+
+
+def _pose_of_result(result: FilterResult) -> PoseEstimate:
+    if result.R is None or result.t is None:
+        return PoseEstimate(None, None, result.mask, result.status.value)
+    return PoseEstimate(result.R, result.t, result.mask)
+
+
+def pose_without_ransac(E: FloatArray | None, logits: FloatArray, x1: FloatArray, x2: FloatArray) -> PoseEstimate:
+    """Pose by ``recoverPose`` on the network's E (3, 3), the 10 % best-scored of the N matches voting."""
+    if E is None:
+        return PoseEstimate.failed(len(logits), "no essential matrix from the network")
+    count = max(int(np.ceil(BEST_SHARE * len(logits))), MIN_MATCHES)
+    best = np.zeros(len(logits), dtype=bool)
+    best[np.argsort(-logits, kind="stable")[:count]] = True
+    return pose_from_essential(np.asarray(E, dtype=np.float64), x1, x2, best)
+
+
+def pose_by_paper_protocol(logits: FloatArray, x1: FloatArray, x2: FloatArray) -> PoseEstimate:
+    """Pose by OpenCV's plain RANSAC at 1e-3 on the normalised planes, from the matches of logit > 0."""
+    rows = np.flatnonzero(logits > 0)
+    if len(rows) < MIN_MATCHES:
+        return PoseEstimate.failed(len(logits), "fewer than 5 matches")
+    E, mask = cv2.findEssentialMat(
+        x1[rows], x2[rows], np.eye(3), method=cv2.RANSAC, prob=0.999, threshold=PAPER_THRESHOLD_NORM
+    )
+    if E is None or mask is None:
+        return PoseEstimate.failed(len(logits), "no model")
+    inliers = np.zeros(len(logits), dtype=bool)
+    inliers[rows] = mask.ravel() > 0
+    return pose_from_essential(E, x1, x2, inliers)
+
+
+@lru_cache(maxsize=1)
+def runtime_source_digest() -> str:
+    """SHA-256 over the package's runtime sources, so that stored results of other code are not taken for its own."""
+    package = Path(__file__).resolve().parent.parent
+    digest = hashlib.sha256()
+    for folder in (package, package / "backends"):
+        for path in sorted(folder.glob("*.py")):
+            digest.update(path.name.encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

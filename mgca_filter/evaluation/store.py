@@ -1,0 +1,76 @@
+"""Results on disk: one JSON file per method, seed and scene, valid for exactly the data and settings it names."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from .methods import PairOutcome
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ResultKey:
+    """What a stored result depends on; two runs share results where all of it is equal.
+
+    ``settings`` are the method's own (:meth:`Method.settings`: options, library versions, model hash), ``data_sha256``
+    is the bundle file's.
+    """
+
+    method: str
+    scene: str
+    seed: int
+    data_sha256: str
+    settings: dict[str, Any]
+
+    @property
+    def file_name(self) -> str:
+        """``scene/method.seedN.digest.json``."""
+        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
+        words = re.sub(r"[^a-z0-9.]+", "-", self.method.lower()).strip("-")
+        return f"{self.scene}/{words}.seed{self.seed}.{digest}.json"
+
+
+class ResultStore:
+    """Outcomes by key; with ``folder=None`` they live in memory only."""
+
+    def __init__(self, folder: str | Path | None) -> None:
+        self._folder = None if folder is None else Path(folder)
+        self._memory: dict[str, dict[int, PairOutcome]] = {}
+
+    def load(self, key: ResultKey) -> dict[int, PairOutcome]:
+        """Outcomes by index of the pair, as far as they are known."""
+        if self._folder is None:
+            return dict(self._memory.get(key.file_name, {}))
+        path = self._folder / key.file_name
+        if not path.exists():
+            return {}
+        try:
+            rows = json.loads(path.read_text())["outcomes"]
+            outcomes = [PairOutcome(**{**row, "kept": tuple(row["kept"]), "mask": tuple(row["mask"])}) for row in rows]
+        except (ValueError, KeyError, TypeError) as error:
+            logger.warning("%s: unreadable, computed again (%s)", path, error)
+            return {}
+        return {outcome.pair: outcome for outcome in outcomes}
+
+    def add(self, key: ResultKey, outcomes: Iterable[PairOutcome]) -> None:
+        """Merge outcomes into what is known. The file is replaced at once, never left half written."""
+        known = self.load(key)
+        known.update({outcome.pair: outcome for outcome in outcomes})
+        if self._folder is None:
+            self._memory[key.file_name] = known
+            return
+        path = self._folder / key.file_name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = {"key": asdict(key), "outcomes": [asdict(known[pair]) for pair in sorted(known)]}
+        temporary = path.with_suffix(f".{os.getpid()}.tmp")
+        temporary.write_text(json.dumps(content))
+        os.replace(temporary, path)
