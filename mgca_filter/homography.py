@@ -39,12 +39,17 @@ def fit_homography(points1: Array, points2: Array, threshold: float, seed: int =
     """
     if len(points1) < 4:
         return None
-    params = usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, threshold, _CONFIDENCE, _MAX_ITERATIONS, seed)
+    # OpenCV holds some constants in pixels: in units of the threshold, any coordinates look like pixels to it.
+    scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
+    params = usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, 1.0, _CONFIDENCE, _MAX_ITERATIONS, seed)
     try:
-        H, _ = cv2.findHomography(np.ascontiguousarray(points1), np.ascontiguousarray(points2), params)
+        H, _ = cv2.findHomography(points1 / threshold, points2 / threshold, params)
     except cv2.error:
         return None
-    if H is None or np.shape(H) != (3, 3) or not np.isfinite(H).all() or abs(H[2, 2]) < 1e-12:
+    if H is None or np.shape(H) != (3, 3) or not np.isfinite(H).all():
+        return None
+    H = np.linalg.inv(scale) @ H @ scale
+    if abs(H[2, 2]) < 1e-12:
         return None
     return np.asarray(H / H[2, 2], dtype=np.float64)
 

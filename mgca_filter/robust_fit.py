@@ -178,47 +178,47 @@ def _first_of_equals(rows: Array) -> NDArray[np.intp]:
 
 def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Array | None:
     """The model by one of OpenCV's estimators; None where it finds nothing."""
-    threshold = options.threshold_px / focal_px
     if options.method == "ransac" and options.seed:
         # The classic RANSAC has a generator of its own with a fixed seed: shuffling is what changes its draws.
         rows = rows[np.random.default_rng(options.seed).permutation(len(rows))]
-    x1, x2 = np.ascontiguousarray(rows[:, :2]), np.ascontiguousarray(rows[:, 2:])
+    # For F OpenCV holds some constants in pixels (MAGSAC fails on the normalised plane); E it normalises itself.
+    unit = 1.0 if calibrated else focal_px
+    x1, x2 = (np.ascontiguousarray(part * unit) for part in (rows[:, :2], rows[:, 2:]))
+    threshold = options.threshold_px / focal_px * unit
+    limits = (options.confidence, options.max_iterations)
     try:
-        if options.method == "ransac":
-            if calibrated:
-                M, _ = cv2.findEssentialMat(
-                    x1, x2, np.eye(3), cv2.RANSAC, options.confidence, threshold, options.max_iterations
-                )
-            else:
-                M, _ = cv2.findFundamentalMat(
-                    x1, x2, cv2.FM_RANSAC, threshold, options.confidence, options.max_iterations
-                )
+        if options.method == "ransac" and calibrated:
+            M, _ = cv2.findEssentialMat(x1, x2, np.eye(3), cv2.RANSAC, limits[0], threshold, limits[1])
+        elif options.method == "ransac":
+            M, _ = cv2.findFundamentalMat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
         else:
             prosac = options.method == "prosac"
-            params = usac_params(
-                cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM,
-                cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC,
-                threshold,
-                options.confidence,
-                options.max_iterations,
-                options.seed,
-            )
+            sampler = cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM
+            score = cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC
+            params = usac_params(sampler, score, threshold, *limits, options.seed)
             if calibrated:
                 M, _ = cv2.findEssentialMat(x1, x2, np.eye(3), np.eye(3), None, None, params)
             else:
                 M, _ = cv2.findFundamentalMat(x1, x2, params)
     except cv2.error:
         return None
-    return _best_of_stack(M, rows, threshold)
+    return _best_of_stack(M, np.diag([unit, unit, 1.0]), rows, options.threshold_px / focal_px)
 
 
-def _best_of_stack(M: Any, rows: Array, threshold: float) -> Array | None:
-    """The best of the models that OpenCV stacks, (3k, 3), of unit Frobenius norm; None where none is usable."""
+def _best_of_stack(M: Any, scale: Array, rows: Array, threshold: float) -> Array | None:
+    """The best of the models that an estimator stacks, (3k, 3); None where none is usable.
+
+    Args:
+        M: for points multiplied by ``scale`` (3, 3); the answer, of unit Frobenius norm, is for ``rows`` (N, 4).
+    """
     if M is None or np.size(M) == 0 or np.size(M) % 9:
         return None
-    models = [m / norm for m in np.reshape(M, (-1, 3, 3)) if np.isfinite(norm := np.linalg.norm(m)) and norm > 0]
+    models = [scale @ m @ scale for m in np.reshape(M, (-1, 3, 3)) if np.isfinite(m).all() and np.any(m)]
     costs = [np.sum(np.minimum(sampson_distance(rows, m), threshold) ** 2) for m in models]
-    return np.asarray(models[int(np.argmin(costs))], dtype=np.float64) if models else None
+    if not models:
+        return None
+    best = np.asarray(models[int(np.argmin(costs))], dtype=np.float64)
+    return best / float(np.linalg.norm(best))
 
 
 def _fit_poselib(rows: Array, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Array | None:
@@ -239,10 +239,9 @@ def _fit_poselib(rows: Array, focal_px: float, options: RobustFitOptions, calibr
     points1, points2 = rows[:, :2] * focal_px, rows[:, 2:] * focal_px
     if not calibrated:
         F, _ = poselib.estimate_fundamental(points1, points2, ransac, {})
-        scale = np.diag([focal_px, focal_px, 1.0])
-        return _best_of_stack(scale @ F @ scale, rows, options.threshold_px / focal_px)
+        return _best_of_stack(F, np.diag([focal_px, focal_px, 1.0]), rows, options.threshold_px / focal_px)
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal_px, 0.0, 0.0]}
     pose, information = poselib.estimate_relative_pose(points1, points2, camera, camera, ransac, {})
     if information.get("num_inliers", 0) == 0:
         return None
-    return _best_of_stack(essential_from_pose(pose.R, pose.t), rows, options.threshold_px / focal_px)
+    return _best_of_stack(essential_from_pose(pose.R, pose.t), np.eye(3), rows, options.threshold_px / focal_px)

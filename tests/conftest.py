@@ -48,12 +48,12 @@ class Scene:
 
 
 def make_scene(kind: str = "general", right: int = 120, wrong: int = 80, noise_px: float = 0.3, seed: int = 0) -> Scene:
-    """A scene of ``kind`` general, planar, rotation or collinear, with wrong matches drawn at random."""
+    """A scene of ``kind`` general, wide, planar, rotation or collinear, with wrong matches drawn at random."""
     rng = np.random.default_rng(seed)
-    R = rotation_from_vector(np.array([0.05, -0.12, 0.03]))
-    t = np.zeros(3) if kind == "rotation" else np.array([1.0, 0.2, 0.1])
+    R = rotation_from_vector(np.array([0.1, -0.5, 0.1]) if kind == "wide" else np.array([0.05, -0.12, 0.03]))
+    t = {"rotation": np.zeros(3), "wide": np.array([3.0, 0.3, 1.0])}.get(kind, np.array([1.0, 0.2, 0.1]))
     pixels = rng.uniform([20, 20], [620, 460], (right, 2))
-    depth = np.full(right, 5.0) + (0.4 * (pixels[:, 0] - 320) / 320 if kind == "planar" else rng.uniform(-1, 6, right))
+    depth = rng.uniform(4, 11, right)
     if kind == "planar":  # 1 / depth is affine in the pixels on any plane
         depth = 1.0 / (0.2 + 0.05 * (pixels[:, 0] - 320) / 320)
     if kind == "collinear":

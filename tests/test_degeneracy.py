@@ -1,0 +1,121 @@
+"""Verdicts on synthetic pairs of every kind: what deserves trust stays OK, what does not is named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from conftest import SIZE, K, Scene, make_scene
+
+from mgca_filter import FilterResult, MatchFilter, Status
+from mgca_filter.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
+from mgca_filter.epipolar import pose_error_deg, rotation_error_deg
+
+
+def run(match_filter: MatchFilter, scene: Scene, **options: object) -> FilterResult:
+    options = {"K1": K, **options}
+    return match_filter.filter(scene.points1, scene.points2, None, attributes=scene.attributes, **options)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (60, 500), (300, 30)])
+def test_general_scene_is_ok(match_filter: MatchFilter, right: int, wrong: int, seed: int) -> None:
+    scene = make_scene(right=right, wrong=wrong, seed=seed)
+    result = run(match_filter, scene)
+    assert result.status is Status.OK
+    assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 2.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (60, 300)])
+def test_plane_keeps_the_pose_and_adds_the_homography(
+    match_filter: MatchFilter, right: int, wrong: int, seed: int
+) -> None:
+    result = run(match_filter, make_scene("planar", right, wrong, seed=seed))
+    assert result.status is Status.PLANAR
+    assert result.info["homography"].shape == (3, 3)
+    assert result.E is not None
+    assert result.R is not None
+    assert result.t is not None
+
+
+def test_plane_without_intrinsics_has_no_pose(match_filter: MatchFilter) -> None:
+    result = run(match_filter, make_scene("planar"), K1=None, size1=SIZE, size2=SIZE)
+    assert result.status is Status.PLANAR
+    assert result.E is None
+    assert result.R is None
+    assert result.F is not None
+    assert result.num_inliers > 100
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (60, 500)])
+def test_rotation_has_no_translation(match_filter: MatchFilter, right: int, wrong: int, seed: int) -> None:
+    scene = make_scene("rotation", right, wrong, seed=seed)
+    result = run(match_filter, scene)
+    assert result.status is Status.PURE_ROTATION
+    assert rotation_error_deg(result.R, scene.R) < 0.1
+    assert result.t is None
+    assert result.E is None
+    assert result.info["homography"][2, 2] == 1.0
+    assert np.count_nonzero(result.mask & scene.inlier) > 0.8 * right
+
+
+def test_collinear_points_have_no_geometry(match_filter: MatchFilter) -> None:
+    result = run(match_filter, make_scene("collinear"))
+    assert result.status is Status.NO_GEOMETRY
+    assert result.E is None
+    assert not result.mask.any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("intrinsics", [K, None])
+def test_only_wrong_matches_have_no_model(match_filter: MatchFilter, seed: int, intrinsics: np.ndarray | None) -> None:
+    result = run(match_filter, make_scene(right=0, wrong=300, seed=seed), K1=intrinsics)
+    assert result.status in (Status.UNRELATED, Status.NO_GEOMETRY)
+    assert result.E is None
+    assert result.R is None
+    assert not result.mask.any()
+
+
+def test_weak_support_is_named(match_filter: MatchFilter) -> None:
+    statuses = [run(match_filter, make_scene(right=12, wrong=10, seed=seed)).status for seed in range(5)]
+    assert Status.LOW_SUPPORT in statuses
+    assert Status.OK not in statuses
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_wrong_intrinsics_are_suspected(match_filter: MatchFilter, seed: int) -> None:
+    scene = make_scene("wide", right=200, wrong=40, seed=seed)
+    wrong_K = K.copy()
+    wrong_K[0, 0], wrong_K[:2, 2] = 2400.0, (1279.5, 959.5)
+    assert run(match_filter, scene, K1=wrong_K).status is Status.SUSPICIOUS_INTRINSICS
+    assert run(match_filter, scene).status is Status.OK
+
+
+def test_false_alarms_fall_with_support_and_rise_with_chance() -> None:
+    values = [log10_false_alarms(100, inliers, 0.05) for inliers in range(10, 100, 10)]
+    assert values == sorted(values, reverse=True)
+    assert log10_false_alarms(100, 40, 0.2) > log10_false_alarms(100, 40, 0.02)
+    assert log10_false_alarms(100, 5, 0.01) == float("inf")
+
+
+def test_chance_rate_is_that_of_random_pairings() -> None:
+    rng = np.random.default_rng(0)
+    E = np.array([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # sideways motion: the distance is |y2 - y1| / sqrt(2)
+    rows = rng.uniform(-1, 1, (600, 4))
+    # |y2 - y1| < d for uniform y in [-1, 1]: 1 - (1 - d / 2)^2
+    d = 0.1 * np.sqrt(2)
+    assert chance_rate(rows, E, 0.1) == pytest.approx(1 - (1 - d / 2) ** 2, abs=0.02)
+    support = measure_support(np.vstack([rows, rows]), E, 0.1)
+    assert support.count == np.count_nonzero(np.abs(rows[:, 3] - rows[:, 1]) < d)
+    assert support.chance_count == pytest.approx(support.count, abs=25)
+
+
+def test_line_and_rotation_fits_set_outliers_aside() -> None:
+    rng = np.random.default_rng(0)
+    line = np.column_stack([np.linspace(0, 10, 80), np.linspace(0, 5, 80)])
+    points = np.vstack([line, rng.uniform(0, 10, (8, 2))])
+    assert np.all(line_distance(points, 0.05)[:80] < 0.05)
+    scene = make_scene("rotation", right=100, wrong=10, noise_px=0.0)
+    rows = np.hstack([(p - K[:2, 2]) / K[0, 0] for p in (scene.points1, scene.points2)])
+    assert rotation_error_deg(fit_rotation(rows, 1 / K[0, 0]), scene.R) < 1e-3
