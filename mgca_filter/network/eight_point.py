@@ -25,7 +25,7 @@ def smallest_eigenvector(A: Tensor) -> Tensor:
     for _ in range(SQUARINGS):
         M = unit_trace(M @ M)
     column = (M * eye).sum(-1).argmax(-1).view(-1, 1, 1)
-    v = M.gather(2, column.expand(-1, M.shape[1], 1)).squeeze(2)
+    v = M.gather(2, column.expand(-1, M.shape[1], 1))[..., 0]
     return v / (v * v).sum(-1, keepdim=True).clamp_min(1e-30).sqrt()
 
 
@@ -77,9 +77,10 @@ def symmetric_epipolar_distance_squared(correspondences: Tensor, E: Tensor) -> T
 
 
 def residual_channel(correspondences: Tensor, E: Tensor) -> Tensor:
-    """Epipolar residual (B, N) as the next stage sees it: log10 of distance² over the label's 1e-4, within ±2.
+    """Epipolar residual (B, N) as the next stage sees it: log10 of distance² over the label's 1e-4, −1 … 1.5.
 
-    The published code feeds the bare residual; inliers differ from each other by factors, hence the logarithm.
+    The published code feeds the bare residual; right and wrong matches differ by factors, hence the logarithm.
+    Its floor lies at a tenth of the label's distance: finer, and rounding errors of E would decide.
     """
     distance = symmetric_epipolar_distance_squared(correspondences, E) / LABEL_DISTANCE
-    return torch.log10(distance + 1e-4).clamp(-4.0, 4.0) * 0.5
+    return torch.log10(distance + 1e-2).clamp_max(3.0) * 0.5

@@ -17,6 +17,7 @@ from .order_aware import OrderAwareBlock
 from .point_cn import PointCN
 
 PRIOR_HIDDEN = 16
+MINIMUM_CONSENSUS = 8  # fewer matches fit any geometry: the prior alone speaks
 
 
 class HeadOutput(NamedTuple):
@@ -53,7 +54,7 @@ class Prior(nn.Module):
         self.output = nn.Linear(PRIOR_HIDDEN, 1)
 
     def forward(self, attributes: Tensor) -> Tensor:
-        return self.output(F.gelu(self.hidden(attributes))).squeeze(-1)
+        return self.output(F.gelu(self.hidden(attributes)))[..., 0]
 
 
 class Head(nn.Module):
@@ -65,7 +66,9 @@ class Head(nn.Module):
         self.weight = nn.Linear(channels, 2)
 
     def forward(self, features: Tensor, prior: Tensor, correspondences: Tensor) -> HeadOutput:
-        logits = self.logit(features).squeeze(-1).float() + prior
+        logits = self.logit(features)[..., 0].float()
+        enough = match_count(logits) >= MINIMUM_CONSENSUS  # (B, 1)
+        logits = torch.where(enough, logits, 0.0) + prior
         a, b = self.weight(features).float().unbind(-1)
         # sigmoid(a) exp(b), normalised to sum 1, is the softmax of log sigmoid(a) + b.
         log_weights = F.logsigmoid(a) + b + torch.where(better_half(logits), 0.0, -1e4)

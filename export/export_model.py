@@ -1,0 +1,50 @@
+"""Write the model files from trained weights and check them: ``python export/export_model.py WEIGHTS``."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+import mgca_filter
+from mgca_filter.calibration import Calibration
+from mgca_filter.network import load_network
+from mgca_filter.onnx_export import ModelDescription, export_model
+
+from parity import check_parity, format_parity
+
+ROOT = Path(__file__).resolve().parent.parent
+WEIGHTS_LICENSE = (
+    "Weights were trained on photographs of which some are licensed for non-commercial use only or carry no "
+    "stated licence; see the model card. The code is MIT."
+)
+
+
+def main() -> int:
+    """0 = written and checked; 1 = the files disagree."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("weights", type=Path, help="weights.safetensors of a training run")
+    parser.add_argument("--name", default="mgca_small")
+    parser.add_argument("--folder", type=Path, default=ROOT / "mgca_filter" / "models")
+    parser.add_argument("--calibration", type=float, nargs=2, default=(1.0, 0.0), metavar=("SCALE", "OFFSET"))
+    parser.add_argument("--training-data", default="67 scenes of real photographs (see the model card)")
+    options = parser.parse_args()
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
+    description = ModelDescription(
+        name=options.name,
+        version=mgca_filter.__version__,
+        git_commit=commit.stdout.strip(),
+        training_data=options.training_data,
+        license=WEIGHTS_LICENSE,
+        calibration=Calibration(*options.calibration),
+    )
+    onnx_path, torch_path = export_model(load_network(options.weights), options.folder, description)
+    rows = check_parity(onnx_path, torch_path)
+    print(format_parity(rows))
+    print(f"{onnx_path} ({onnx_path.stat().st_size / 2**20:.2f} MiB)")
+    return 0 if all(row.passed for row in rows) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
