@@ -1,0 +1,223 @@
+"""Model files and inference backends: one contract, broken files named, PyTorch where ONNX Runtime is missing."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import struct
+import sys
+import types
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import METADATA, build_model
+
+import mgca_filter.backends.torch_backend as torch_backend
+from mgca_filter import BackendError, ModelError
+from mgca_filter.backends import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend
+from mgca_filter.backends.torch_backend import read_safetensors_metadata
+from mgca_filter.calibration import AttributePrior, Calibration, gelu
+
+
+def random_input(count: int, batch: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(count)
+    return rng.uniform(-1, 1, (batch, count, 4)).astype(np.float32), rng.random((batch, count, 8)).astype(np.float32)
+
+
+def write_safetensors(path: Path, metadata: dict[str, str], payload: bytes = b"\0" * 4) -> Path:
+    """A file of the safetensors format with one float."""
+    header = {"__metadata__": metadata, "w": {"dtype": "F32", "shape": [1], "data_offsets": [0, 4]}}
+    text = json.dumps(header).encode()
+    path.write_bytes(struct.pack("<Q", len(text)) + text + payload)
+    return path
+
+
+@pytest.fixture
+def torch_stand_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network with the formula of the test model in place of the package's own."""
+    torch = pytest.importorskip("torch")
+
+    class RatioTest(torch.nn.Module):
+        def forward(self, correspondences, attributes):  # noqa: ANN001, ANN202
+            essential = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]) / 2**0.5
+            return types.SimpleNamespace(
+                logits=6.4 - 8 * attributes[..., 0], essential=essential.expand(len(correspondences), 3, 3)
+            )
+
+    network = types.ModuleType("mgca_filter.network")
+    network.load_network = lambda path: RatioTest()
+    monkeypatch.setitem(sys.modules, "mgca_filter.network", network)
+
+
+class BackendContract:
+    """What holds for every backend."""
+
+    @pytest.fixture
+    def backend(self, model_file: Path) -> Backend:
+        raise NotImplementedError
+
+    @pytest.mark.parametrize("count", [1, 7, 8, 9, 127, 2000])
+    def test_shapes_and_values(self, backend: Backend, count: int) -> None:
+        correspondences, attributes = random_input(count)
+        logits, essential = backend.infer(correspondences, attributes)
+        assert logits.shape == (2, count)
+        assert essential.shape == (2, 3, 3)
+        assert logits.dtype == essential.dtype == np.float32
+        np.testing.assert_allclose(logits, 6.4 - 8 * attributes[..., 0], atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(essential, axis=(1, 2)), 1.0, atol=1e-6)
+
+    def test_metadata_are_read(self, backend: Backend) -> None:
+        assert backend.metadata.name == "ratio_test"
+        assert backend.metadata.candidate_max_ratio == 0.95
+        assert backend.metadata.candidate_min_count == 32
+        assert len(backend.metadata.sha256) == 64
+
+    def test_pickle_reopens_the_model(self, backend: Backend) -> None:
+        again = pickle.loads(pickle.dumps(backend))
+        for one, other in zip(backend.infer(*random_input(9)), again.infer(*random_input(9))):
+            np.testing.assert_array_equal(one, other)
+
+    def test_permuting_matches_permutes_logits(self, backend: Backend) -> None:
+        correspondences, attributes = random_input(50)
+        order = np.random.default_rng(1).permutation(50)
+        logits = backend.infer(correspondences, attributes)[0]
+        np.testing.assert_allclose(
+            backend.infer(correspondences[:, order], attributes[:, order])[0], logits[:, order], atol=1e-5
+        )
+
+
+class TestOnnxBackend(BackendContract):
+    @pytest.fixture
+    def backend(self, model_file: Path) -> Backend:
+        return OnnxBackend(model_file)
+
+    def test_refused_input_is_a_backend_error(self, backend: Backend) -> None:
+        with pytest.raises(BackendError):
+            backend.infer(np.zeros((1, 5, 3), dtype=np.float32), np.zeros((1, 5, 8), dtype=np.float32))
+
+
+@pytest.mark.usefixtures("torch_stand_in")
+class TestTorchBackend(BackendContract):
+    @pytest.fixture
+    def backend(self, tmp_path: Path) -> Backend:
+        return TorchBackend(write_safetensors(tmp_path / "m.safetensors", METADATA))
+
+
+@pytest.mark.parametrize("key", METADATA_KEYS)
+def test_missing_metadata_is_named(key: str, tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx", {k: v for k, v in METADATA.items() if k != key})
+    with pytest.raises(ModelError, match=rf"m\.onnx.*{key}"):
+        OnnxBackend(path)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("contract_version", "2"),
+        ("calibration", "{}"),
+        ("calibration", '{"scale": "nan", "offset": 0}'),
+        ("decision_threshold", "high"),
+        ("candidate_rule", "[]"),
+        ("config", "no json"),
+        ("prior", '{"weight1": [[1]], "bias1": [0], "weight2": [1], "bias2": 0}'),
+    ],
+)
+def test_unreadable_metadata_are_named(key: str, value: str, tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx", {**METADATA, key: value})
+    with pytest.raises(ModelError, match=rf"m\.onnx.*{key.replace('_', '.')}"):
+        OnnxBackend(path)
+
+
+def test_other_inputs_or_outputs_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="inputs"):
+        OnnxBackend(build_model(tmp_path / "a.onnx", input_names=("points", "attributes")))
+    with pytest.raises(ModelError, match="outputs"):
+        OnnxBackend(build_model(tmp_path / "b.onnx", output_names=("scores", "essential")))
+
+
+@pytest.mark.parametrize("suffix", [".onnx", ".safetensors"])
+def test_broken_files_are_named(suffix: str, tmp_path: Path, model_file: Path) -> None:
+    good = write_safetensors(tmp_path / "good", METADATA) if suffix == ".safetensors" else model_file
+    content = good.read_bytes()
+    for name, data in {"empty": b"", "noise": b"no model at all" * 9, "cut": content[: len(content) // 2]}.items():
+        path = tmp_path / f"{name}{suffix}"
+        path.write_bytes(data)
+        with pytest.raises(ModelError, match=f"{name}{suffix}"):
+            open_backend(path)
+    with pytest.raises(ModelError, match=f"absent{suffix}.*not found"):
+        open_backend(tmp_path / f"absent{suffix}")
+
+
+def test_cut_off_tensors_are_noticed(tmp_path: Path) -> None:
+    path = write_safetensors(tmp_path / "m.safetensors", METADATA, payload=b"\0\0")
+    with pytest.raises(ModelError, match="cut off"):
+        read_safetensors_metadata(path)
+
+
+def without_onnxruntime(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+
+
+@pytest.mark.usefixtures("torch_stand_in")
+def test_torch_takes_over_with_one_warning(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = build_model(tmp_path / "m.onnx")
+    write_safetensors(tmp_path / "m.safetensors", METADATA)
+    expected = open_backend(path).infer(*random_input(40))
+    without_onnxruntime(monkeypatch)
+    with pytest.warns(RuntimeWarning, match="PyTorch") as caught:
+        backend = open_backend(path)
+    assert len(caught) == 1
+    assert backend.name == "torch"
+    for one, other in zip(backend.infer(*random_input(40)), expected):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.usefixtures("torch_stand_in")
+def test_torch_on_request_needs_no_warning(tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx")
+    write_safetensors(tmp_path / "m.safetensors", METADATA)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert open_backend(path, "torch").name == "torch"
+        assert open_backend(path.with_suffix(".safetensors")).name == "torch"
+        assert open_backend(path, "onnxruntime").name == "onnxruntime"
+
+
+def test_no_runtime_at_all_is_a_backend_error(
+    model_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_onnxruntime(monkeypatch)
+    with pytest.raises(BackendError, match="ONNX Runtime"):
+        open_backend(model_file)
+    with pytest.raises(BackendError, match="ONNX Runtime"):
+        open_backend(model_file, "onnxruntime")
+    weights = write_safetensors(tmp_path / "m.safetensors", METADATA)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(BackendError, match="PyTorch"):
+        torch_backend.TorchBackend(weights)
+
+
+@pytest.mark.parametrize(
+    "providers", [["NoSuchProvider"], ["NoSuchProvider", "CPUExecutionProvider"], [("NoSuchProvider", {"device": 0})]]
+)
+def test_missing_provider_falls_back_with_one_warning(model_file: Path, providers: list) -> None:
+    with pytest.warns(RuntimeWarning, match="NoSuchProvider") as caught:
+        backend = OnnxBackend(model_file, providers)
+    assert len(caught) == 1
+    assert backend.infer(*random_input(5))[0].shape == (2, 5)
+
+
+def test_calibration_and_prior_follow_their_formulas() -> None:
+    probabilities = Calibration(2.0, -1.0).probabilities([-1000.0, 0.5, 1000.0])
+    np.testing.assert_allclose(probabilities, [0.0, 0.5, 1.0], atol=1e-7)
+    from math import erf, sqrt
+
+    x = np.linspace(-6, 6, 101)
+    exact = np.array([0.5 * v * (1 + erf(v / sqrt(2))) for v in x])
+    np.testing.assert_allclose(gelu(x), exact, atol=1e-6)
+    prior = AttributePrior(np.eye(8)[:2], np.array([0.0, 1.0]), np.array([2.0, -1.0]), 0.5)
+    attributes = np.random.default_rng(0).random((5, 8)).astype(np.float32)
+    expected = 2 * gelu(attributes[:, 0].astype(float)) - gelu(attributes[:, 1] + 1.0) + 0.5
+    np.testing.assert_allclose(prior.logits(attributes), expected, atol=1e-6)

@@ -1,0 +1,301 @@
+"""The public door: results, laws of the flow, and every option makes a difference."""
+
+from __future__ import annotations
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import METADATA, SIZE, K, Scene, build_model, make_scene
+
+import mgca_filter
+from mgca_filter import FilterResult, MatchAttributes, MatchFilter, MatchPair, Status, filter_many, filter_matches
+from mgca_filter.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.scoring import MAX_NETWORK_MATCHES
+
+
+def run(scene: Scene, model_file: Path, **options: object) -> FilterResult:
+    options = {"K1": K, "attributes": scene.attributes, "model": model_file, **options}
+    return filter_matches(scene.points1, scene.points2, None, **options)
+
+
+def assert_same(one: FilterResult, other: FilterResult) -> None:
+    for name in ("mask", "scores", "E", "F", "R", "t"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    assert one.status is other.status
+
+
+def test_three_positional_arguments_are_enough(scene: Scene, model_file: Path) -> None:
+    result = filter_matches(*scene.keypoints(), scene.knn_matches(), model=model_file)
+    assert result.status is Status.OK
+    assert result.info["intrinsics"] == "guessed"
+    assert len(result.info["assumptions"]) == 2
+    assert np.mean(result.mask == scene.inlier) > 0.95
+
+
+def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:
+    result = run(scene, model_file)
+    assert result.status is Status.OK
+    assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+    assert result.mask.dtype == bool
+    assert result.mask.shape == result.scores.shape == (200,)
+    assert result.scores.dtype == np.float32
+    assert result.num_inliers == result.mask.sum() == len(result.matches)
+    assert result.info["logits"].dtype == np.float32
+    assert result.info["backend"] == "onnxruntime"
+    assert result.info["model"] == "ratio_test"
+    assert len(result.info["model_sha256"]) == 64
+    assert result.info["intrinsics"] == "given"
+    assert set(result.info["timings_ms"]) == {"prepare", "network", "fit", "verdict", "total"}
+    np.testing.assert_allclose(np.linalg.svd(result.E, compute_uv=False), [0.5**0.5, 0.5**0.5, 0], atol=1e-9)
+    pixels = np.hstack([scene.points1, scene.points2])
+    np.testing.assert_array_equal(result.mask, sampson_distance(pixels, result.F) < 1.0)
+    with pytest.raises(AttributeError):
+        result.mask = result.mask  # type: ignore[misc]
+
+
+def test_every_type_of_input_gives_the_same_answer(scene: Scene, model_file: Path) -> None:
+    options = {"K1": K, "attributes": scene.attributes, "model": model_file}
+    rows = np.arange(200)
+    reference = filter_matches(scene.points1, scene.points2, None, **options)
+    for kp1, kp2, matches in (
+        (scene.points1[:, None], scene.points2[:, None], np.stack([rows, rows], axis=1)),
+        (scene.points1.tolist(), scene.points2.tolist(), tuple(cv2.DMatch(i, i, float(i)) for i in range(200))),
+    ):
+        assert_same(filter_matches(kp1, kp2, matches, **options), reference)
+
+
+def test_kept_matches_come_in_the_callers_type(scene: Scene, model_file: Path) -> None:
+    kp1, kp2 = scene.keypoints()
+    knn = scene.knn_matches()
+    result = filter_matches(kp1, kp2, knn, model=model_file)
+    assert result.matches == [knn[i] for i in np.flatnonzero(result.mask)]
+    flat = [row[0] for row in knn]
+    result = filter_matches(kp1, kp2, flat, model=model_file)
+    assert result.matches == [flat[i] for i in np.flatnonzero(result.mask)]
+
+
+def test_permuting_the_matches_permutes_the_answer(scene: Scene, model_file: Path) -> None:
+    order = np.random.default_rng(0).permutation(200)
+    shuffled = replace(
+        scene,
+        points1=scene.points1[order],
+        points2=scene.points2[order],
+        attributes=scene.attributes.take(order),
+    )
+    one, other = run(scene, model_file), run(shuffled, model_file)
+    np.testing.assert_allclose(one.scores[order], other.scores, atol=1e-6)
+    np.testing.assert_array_equal(one.mask[order], other.mask)
+    np.testing.assert_allclose(one.E, other.E, atol=1e-6)
+
+
+def test_swapping_the_images_inverts_the_pose(scene: Scene, model_file: Path) -> None:
+    swapped = replace(scene, points1=scene.points2, points2=scene.points1)
+    one, other = run(scene, model_file), run(swapped, model_file)
+    assert pose_error_deg(other.R, other.t, one.R.T, -one.R.T @ one.t) < 0.5
+
+
+def test_scaling_pixels_with_the_intrinsics_changes_nothing(scene: Scene, model_file: Path) -> None:
+    doubled = replace(scene, points1=2 * scene.points1, points2=2 * scene.points2)
+    K2x = np.diag([2.0, 2.0, 1.0]) @ K
+    one = run(scene, model_file, threshold=0.5)
+    other = run(doubled, model_file, K1=K2x, threshold=1.0)
+    assert pose_error_deg(other.R, other.t, one.R, one.t) < 0.5
+    np.testing.assert_allclose(one.scores, other.scores, atol=1e-6)
+
+
+def test_same_seed_gives_the_same_bits(scene: Scene, model_file: Path) -> None:
+    assert_same(run(scene, model_file, seed=5), run(scene, model_file, seed=5))
+
+
+def test_threshold_moves_the_mask_only(scene: Scene, model_file: Path) -> None:
+    tight, loose = run(scene, model_file, threshold=0.1), run(scene, model_file, threshold=5.0)
+    np.testing.assert_array_equal(tight.E, loose.E)
+    assert tight.num_inliers < run(scene, model_file).num_inliers < loose.num_inliers
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"method": "magsac"},
+        {"method": "ransac"},
+        {"method": "none"},
+        {"confidence": 0.01},
+        {"seed": 1},
+        {"K1": None},
+        {"K2": np.diag([1.2, 1.2, 1.0]) @ K},
+        {"dist1": [0.2, -0.1, 0.0, 0.0]},
+        {"dist2": [0.2, -0.1, 0.0, 0.0]},
+        {"attributes": None},
+        {"K1": None, "size1": (4000, 3000)},
+        {"K1": None, "size2": (4000, 3000)},
+    ],
+    ids=lambda change: "-".join(change),
+)
+def test_every_option_changes_the_answer(change: dict, model_file: Path) -> None:
+    hard = make_scene(right=60, wrong=240, noise_px=0.8)
+    base = {"K1": None} if change.get("K1", 0) is None and len(change) > 1 else {}
+    one, other = run(hard, model_file, **base), run(hard, model_file, **change)
+    assert one.E is not None
+    assert other.E is None or not np.array_equal(one.E, other.E)
+
+
+def test_poselib_finds_the_pose(scene: Scene, model_file: Path) -> None:
+    pytest.importorskip("poselib")
+    result = run(scene, model_file, method="poselib")
+    assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+
+
+def test_method_none_keeps_what_the_network_believes(scene: Scene, model_file: Path) -> None:
+    result = run(scene, model_file, method="none")
+    np.testing.assert_array_equal(result.mask, result.scores > 0.5)
+    assert result.E is None
+    assert result.F is None
+    assert result.R is None
+    assert result.status is Status.OK
+    assert result.info["network_essential"].shape == (3, 3)
+
+
+def test_second_intrinsics_default_to_the_first(scene: Scene, model_file: Path) -> None:
+    one, other = run(scene, model_file, K1=K), run(scene, model_file, K1=K, K2=K)
+    assert_same(one, other)
+    assert one.info["assumptions"] == ["both images share K1"]
+    assert other.info["assumptions"] == []
+
+
+def test_distortion_is_undone(scene: Scene, model_file: Path) -> None:
+    coefficients = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
+    rays = [np.column_stack([(p - K[:2, 2]) / K[0, 0], np.ones(len(p))]) for p in (scene.points1, scene.points2)]
+    bent = [cv2.projectPoints(r, np.zeros(3), np.zeros(3), K, coefficients)[0].reshape(-1, 2) for r in rays]
+    distorted = replace(scene, points1=bent[0], points2=bent[1])
+    result = run(distorted, model_file, dist1=coefficients)
+    assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+    assert result.num_inliers > 110
+    assert run(distorted, model_file).num_inliers < result.num_inliers
+
+
+def test_attributes_of_the_caller_override_those_of_the_matches(scene: Scene, model_file: Path) -> None:
+    kp1, kp2 = scene.keypoints()
+    read = filter_matches(kp1, kp2, scene.knn_matches(), model=model_file)
+    candidate = scene.attributes.ratio < 0.95
+    expected = 6.4 - 8 * scene.attributes.ratio
+    np.testing.assert_allclose(read.info["logits"][candidate], expected[candidate], atol=1e-4)
+    worst = MatchAttributes(ratio=np.full(200, 0.9, dtype=np.float32))
+    given = filter_matches(kp1, kp2, scene.knn_matches(), attributes=worst, model=model_file)
+    np.testing.assert_allclose(given.info["logits"], -0.8, atol=1e-4)
+
+
+def test_matches_that_are_no_candidates_score_by_the_prior_and_may_return(scene: Scene, model_file: Path) -> None:
+    ratio = scene.attributes.ratio.copy()
+    hopeless = np.flatnonzero(scene.inlier)[:20]
+    ratio[hopeless] = 0.99
+    attributes = replace(scene.attributes, ratio=ratio)
+    result = run(scene, model_file, attributes=attributes)
+    assert result.info["num_network_matches"] == np.count_nonzero(ratio < 0.95)
+    assert (result.scores[hopeless] < 0.5).all()
+    assert (result.info["logits"][hopeless] < 0).all()
+    assert result.mask[hopeless].mean() > 0.8
+
+
+def test_calibration_of_the_model_file_is_applied(scene: Scene, tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx", {**METADATA, "calibration": '{"scale": 0.5, "offset": 1.0}'})
+    result = run(scene, path)
+    expected = 1 / (1 + np.exp(-(0.5 * result.info["logits"] + 1.0)))
+    np.testing.assert_allclose(result.scores, expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_many_matches_are_all_tested(model_file: Path, bare: bool) -> None:
+    scene = make_scene(right=14000, wrong=6000)
+    attributes = None if bare else replace(scene.attributes, best=None)
+    result = run(scene, model_file, attributes=attributes)
+    assert result.info["num_network_matches"] == MAX_NETWORK_MATCHES
+    assert result.status is Status.OK
+    assert result.mask[scene.inlier].mean() > 0.95
+    assert result.mask[~scene.inlier].mean() < 0.1
+    assert result.info["timings_ms"]["verdict"] < 5000
+    if not bare:
+        sent = result.info["logits"] >= np.sort(result.info["logits"])[-MAX_NETWORK_MATCHES]
+        assert scene.attributes.ratio[sent].max() <= scene.attributes.ratio[~sent].min() + 1e-6
+
+
+def test_object_and_function_agree_and_pairs_batch(match_filter: MatchFilter, model_file: Path) -> None:
+    scenes = [make_scene(seed=seed, right=100 + 10 * (seed % 2), wrong=50) for seed in range(4)]
+    pairs = [MatchPair(s.points1, s.points2, None, K1=K, attributes=s.attributes) for s in scenes]
+    singles = [run(s, model_file) for s in scenes]
+    for one, other in zip(singles, match_filter.filter_many(pairs)):
+        np.testing.assert_allclose(one.scores, other.scores, atol=1e-6)
+        np.testing.assert_array_equal(one.mask, other.mask)
+    tuples = filter_many([(s.points1, s.points2, None) for s in scenes], model=model_file)
+    assert [len(r.mask) for r in tuples] == [150, 160, 150, 160]
+    assert filter_many([], model=model_file) == []
+
+
+def test_filter_is_thread_safe(match_filter: MatchFilter) -> None:
+    scenes = [make_scene(seed=seed) for seed in range(8)]
+
+    def work(s: Scene) -> FilterResult:
+        return match_filter.filter(s.points1, s.points2, None, K1=K, attributes=s.attributes)
+
+    with ThreadPoolExecutor(4) as pool:
+        for one, other in zip(pool.map(work, scenes), map(work, scenes)):
+            assert_same(one, other)
+
+
+def test_filter_is_picklable(match_filter: MatchFilter, scene: Scene) -> None:
+    again = pickle.loads(pickle.dumps(match_filter))
+    arguments = (scene.points1, scene.points2, None)
+    assert_same(again.filter(*arguments, K1=K), match_filter.filter(*arguments, K1=K))
+
+
+def test_a_changed_model_file_is_read_again(scene: Scene, tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx")
+    first = run(scene, path)
+    build_model(path, {**METADATA, "name": "another model"})
+    assert run(scene, path).info["model"] != first.info["model"]
+
+
+@pytest.fixture(scope="module")
+def photographs() -> tuple[np.ndarray, np.ndarray]:
+    """Two views of a textured plane related by a homography, 1500 x 1200."""
+    noise = np.random.default_rng(0).integers(0, 256, (100, 125)).astype(np.uint8)
+    image = cv2.resize(noise, (1500, 1200), interpolation=cv2.INTER_CUBIC)
+    H = np.array([[0.95, 0.03, 20.0], [-0.02, 0.97, 30.0], [2e-5, 1e-5, 1.0]])
+    return image, cv2.warpPerspective(image, H, (1500, 1200))
+
+
+@pytest.mark.parametrize("detector", ["sift", "orb", cv2.SIFT.create(nfeatures=500)])
+def test_match_images_in_pixels_of_the_originals(
+    photographs: tuple[np.ndarray, np.ndarray], detector: object, model_file: Path
+) -> None:
+    found = mgca_filter.match_images(*photographs, detector=detector, max_keypoints=800, model=model_file)
+    assert isinstance(found.keypoints1[0], cv2.KeyPoint)
+    assert len(found.matches) == len(found.keypoints1) == len(found.result.mask)
+    assert found.result.status in (Status.PLANAR, Status.PURE_ROTATION)
+    H = np.array([[0.95, 0.03, 20.0], [-0.02, 0.97, 30.0], [2e-5, 1e-5, 1.0]])
+    kept = [row[0] for row in found.result.matches]
+    source = np.array([[found.keypoints1[m.queryIdx].pt for m in kept]], dtype=np.float64)
+    target = np.array([found.keypoints2[m.trainIdx].pt for m in kept])
+    distance = np.linalg.norm(cv2.perspectiveTransform(source, H)[0] - target, axis=1)
+    assert np.median(distance) < 1.5
+    assert found.result.info["assumptions"][0].endswith("guessed from the image size")
+
+
+def test_match_images_of_blank_images(model_file: Path) -> None:
+    blank = np.zeros((60, 80), dtype=np.uint8)
+    found = mgca_filter.match_images(blank, blank, model=model_file)
+    assert found.result.status is Status.TOO_FEW_MATCHES
+    assert len(found.matches) == 0
+    with pytest.raises(TypeError, match="detector"):
+        mgca_filter.match_images(blank, blank, detector=7, model=model_file)
+
+
+def test_sizes_help_the_guess(scene: Scene, model_file: Path) -> None:
+    sized = run(scene, model_file, K1=None, size1=SIZE, size2=SIZE)
+    assert sized.info["assumptions"][0] == "focal length 768 px of image 1 guessed from the image size"
+    extent = run(scene, model_file, K1=None)
+    assert "extent of the keypoints" in extent.info["assumptions"][0]
