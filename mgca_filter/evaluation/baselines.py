@@ -19,6 +19,9 @@ from .methods import MIN_MATCHES, Answer, BoolArray, FloatArray, PoseEstimate, S
 REVISION = 1
 """Part of every stored result's key: raise it when a change in this package alters what a rival gives."""
 
+NEVER_CONFIDENT = 1.0 - 1e-9
+"""Confidence of time-matched rows, at which an estimator uses up its iterations instead of stopping early."""
+
 INFINITE_DEPTH = 1e9
 """``recoverPose`` drops points farther than 50 baselines unless told otherwise."""
 
@@ -87,7 +90,8 @@ class OpenCvEstimator:
 
     @property
     def name(self) -> str:
-        return f"{self.kind} {self.threshold_px:g} px"
+        budget = f" {self.max_iterations} iterations" if self.confidence == NEVER_CONFIDENT else ""
+        return f"{self.kind} {self.threshold_px:g} px{budget}"
 
     @property
     def ordered(self) -> bool:
@@ -115,16 +119,21 @@ class OpenCvEstimator:
 
 @dataclass(frozen=True)
 class PoseLibEstimator:
-    """``poselib.estimate_relative_pose`` at its defaults but for threshold, seed and ``progressive_sampling``."""
+    """``poselib.estimate_relative_pose`` at its defaults but for threshold, seed and ``progressive_sampling``.
+
+    ``iterations`` makes it a time-matched row: that many, whatever was found before.
+    """
 
     threshold_px: float
     progressive: bool = False
+    iterations: int | None = None
 
     seeded: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
-        return f"PoseLib {'progressive ' if self.progressive else ''}{self.threshold_px:g} px"
+        budget = "" if self.iterations is None else f" {self.iterations} iterations"
+        return f"PoseLib {'progressive ' if self.progressive else ''}{self.threshold_px:g} px{budget}"
 
     @property
     def ordered(self) -> bool:
@@ -133,7 +142,8 @@ class PoseLibEstimator:
     def settings(self) -> dict[str, Any]:
         import poselib
 
-        return {**asdict(self), "poselib": poselib.__version__}
+        options = {key: value for key, value in asdict(self).items() if value is not None}
+        return {**options, "poselib": poselib.__version__}
 
     def estimate(self, pair: ScenePair, rows: Any, seed: int) -> PoseEstimate:
         import poselib
@@ -143,6 +153,8 @@ class PoseLibEstimator:
             "progressive_sampling": self.progressive,
             "seed": seed,
         }
+        if self.iterations is not None:
+            options |= {"min_iterations": self.iterations, "max_iterations": self.iterations}
         camera1, camera2 = _pinhole(pair.K1, pair.image_size1), _pinhole(pair.K2, pair.image_size2)
         pose, info = poselib.estimate_relative_pose(
             pair.points1[rows], pair.points2[rows], camera1, camera2, options, {}

@@ -2,15 +2,17 @@
 
 Selections are ``NN`` (every nearest neighbour), ``mutual``, ``ratio 0.8`` and ``GMS``; estimators ``RANSAC``,
 ``MAGSAC``, ``ACCURATE``, ``PROSAC`` (OpenCV), ``PoseLib`` and ``PoseLib progressive``, each with a threshold such as
-``0.75 px``. The filter's own rows are listed in :data:`mgca_filter.evaluation.product.VARIANTS`; a selection before
-them stands for users who filter their matches beforehand.
+``0.75 px``. A number of iterations after it (``PROSAC 0.5 px 20000 iterations``) makes a time-matched row: raise it
+until the median time equals the filter's. The filter's own rows are listed in
+:data:`mgca_filter.evaluation.product.VARIANTS`; a selection before them stands for users who filter their matches
+beforehand.
 """
 
 from __future__ import annotations
 
 import re
 
-from .baselines import Estimator, OpenCvEstimator, PoseLibEstimator, Rival
+from .baselines import NEVER_CONFIDENT, Estimator, OpenCvEstimator, PoseLibEstimator, Rival
 from .methods import Method, Selection
 from .product import VARIANTS, ProductMethod
 
@@ -47,7 +49,10 @@ RIVAL_ROWS = (
 
 PRODUCT_ROWS = tuple(VARIANTS)
 
-_ESTIMATOR = re.compile(r"(?P<kind>RANSAC|MAGSAC|ACCURATE|PROSAC|PoseLib progressive|PoseLib)(?: (?P<px>[\d.]+) px)?")
+_ESTIMATOR = re.compile(
+    r"(?P<kind>RANSAC|MAGSAC|ACCURATE|PROSAC|PoseLib progressive|PoseLib)"
+    r"(?: (?P<px>\d*\.?\d+) px)?(?: (?P<iterations>[1-9]\d*) iterations)?"
+)
 
 
 def parse_method(name: str, model: str | None = None) -> Method:
@@ -71,7 +76,11 @@ def parse_method(name: str, model: str | None = None) -> Method:
             f"{RIVAL_ROWS[-1]!r}, or one of {', '.join(VARIANTS)}"
         )
     kind = match["kind"]
-    return Rival(selection, _build_estimator(kind, float(match["px"] or DEFAULT_THRESHOLD_PX[kind]), name))
+    threshold_px = float(match["px"] or DEFAULT_THRESHOLD_PX[kind])
+    if threshold_px == 0:
+        raise ValueError(f"{name!r}: the threshold must be positive")
+    iterations = None if match["iterations"] is None else int(match["iterations"])
+    return Rival(selection, _build_estimator(kind, threshold_px, iterations))
 
 
 def _parse_selection(tests: list[str], name: str) -> Selection:
@@ -89,11 +98,11 @@ def _parse_selection(tests: list[str], name: str) -> Selection:
     return Selection(mutual, max_ratio, gms)
 
 
-def _build_estimator(kind: str, threshold_px: float, name: str) -> Estimator:
-    if not threshold_px > 0:
-        raise ValueError(f"{name!r}: the threshold must be positive")
+def _build_estimator(kind: str, threshold_px: float, iterations: int | None) -> Estimator:
     if kind.startswith("PoseLib"):
-        return PoseLibEstimator(threshold_px, progressive=kind.endswith("progressive"))
+        return PoseLibEstimator(threshold_px, kind.endswith("progressive"), iterations)
+    if iterations is not None:
+        return OpenCvEstimator(kind, threshold_px, NEVER_CONFIDENT, iterations)
     if kind == "RANSAC":
         return OpenCvEstimator(kind, threshold_px, RANSAC_CONFIDENCE, RANSAC_MAX_ITERATIONS)
     return OpenCvEstimator(kind, threshold_px)
