@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .backends import BACKENDS, Backend, Providers, open_backend
+from .backends import BACKENDS, Providers, shared_backend
 from .correspondences import MatchAttributes
+from .option_checks import check_choice, check_number, check_path, check_providers, check_seed
 from .pair_input import PairInput, prepare_pair
 from .result import FilterResult, Status
 from .robust_fit import METHODS, MIN_MATCHES, RobustFitOptions, estimate_model, match_order
@@ -23,9 +23,6 @@ from .verdict import Verdict, count_distinct, judge
 # With fewer accepted matches than this, the best-scored ones fill up what the robust fit sees.
 MIN_FIT_MATCHES = 32
 _BATCH_PAIRS = 8
-
-_open_backends: dict[tuple[Any, ...], Backend] = {}
-_open_lock = threading.Lock()
 
 
 def model_path() -> Path:
@@ -82,14 +79,14 @@ class MatchFilter:
         backend: str = "auto",
         seed: int = 0,
     ) -> None:
-        _check_choice(method, METHODS, "method")
-        _check_choice(backend, BACKENDS, "backend")
-        self.threshold = _check_number(threshold, "threshold", 0.0, float("inf"))
+        check_choice(method, METHODS, "method")
+        check_choice(backend, BACKENDS, "backend")
+        self.threshold = check_number(threshold, "threshold", 0.0, float("inf"))
         self.method = method
         self.fit_options = RobustFitOptions(
-            method=method, confidence=_check_number(confidence, "confidence", 0.0, 1.0), seed=_check_seed(seed)
+            method=method, confidence=check_number(confidence, "confidence", 0.0, 1.0), seed=check_seed(seed)
         )
-        self._backend = _shared_backend(_check_path(model), backend, _check_providers(providers))
+        self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
 
     def filter(
         self,
@@ -300,56 +297,3 @@ def _verdict_by_scores(pair: PairInput, scores: NDArray[np.float32]) -> Verdict:
 
 def _milliseconds_since(started: float) -> float:
     return 1000.0 * (time.perf_counter() - started)
-
-
-def _shared_backend(path: Path, backend: str, providers: Providers | None) -> Backend:
-    """The open backend of a model file, opened once per process and again when the file changes."""
-    path = path.resolve()
-    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
-    key = (path, stamp, backend, repr(providers))
-    with _open_lock:
-        if key not in _open_backends:
-            _open_backends[key] = open_backend(path, backend, providers)
-        return _open_backends[key]
-
-
-def _check_choice(value: Any, choices: tuple[str, ...], name: str) -> None:
-    if not isinstance(value, str):
-        raise TypeError(f"{name}: expected one of {', '.join(choices)}, got {type(value).__name__}")
-    if value not in choices:
-        raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {value!r}")
-
-
-def _check_number(value: Any, name: str, low: float, high: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{name}: expected a number, got {type(value).__name__}")
-    if not low < value < high:
-        raise ValueError(f"{name}: expected a number above {low:g} and below {high:g}, got {value}")
-    return float(value)
-
-
-def _check_seed(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"seed: expected an integer, got {type(value).__name__}")
-    if value < 0:
-        raise ValueError(f"seed: expected 0 or more, got {value}")
-    return int(value)
-
-
-def _check_path(value: Any) -> Path:
-    if value is None:
-        return model_path()
-    if not isinstance(value, (str, Path)):
-        raise TypeError(f"model: expected a path, got {type(value).__name__}")
-    return Path(value)
-
-
-def _check_providers(value: Any) -> Providers | None:
-    if value is None:
-        return None
-    if isinstance(value, str) or not isinstance(value, (list, tuple)):
-        raise TypeError(f"providers: expected a list of provider names, got {type(value).__name__}")
-    for item in value:
-        if not (isinstance(item, str) or (isinstance(item, tuple) and len(item) == 2 and isinstance(item[0], str))):
-            raise TypeError(f"providers: expected names or (name, options), got {item!r}")
-    return value

@@ -15,7 +15,7 @@ import pytest
 from conftest import METADATA, build_model
 
 import mgca_filter.backends.torch_backend as torch_backend
-from mgca_filter import BackendError, ModelError
+from mgca_filter import BackendError, ModelError, filter_matches
 from mgca_filter.backends import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend
 from mgca_filter.backends.torch_backend import read_safetensors_metadata
 from mgca_filter.calibration import AttributePrior, Calibration, gelu
@@ -172,6 +172,26 @@ def test_torch_takes_over_with_one_warning(tmp_path: Path, monkeypatch: pytest.M
     assert backend.name == "torch"
     for one, other in zip(backend.infer(*random_input(40)), expected):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.usefixtures("torch_stand_in")
+@pytest.mark.parametrize("step", ["InferenceSession", "run"])
+def test_torch_takes_over_where_onnxruntime_fails(step: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import onnxruntime
+
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("out of order")
+
+    path = build_model(tmp_path / "m.onnx")
+    write_safetensors(tmp_path / "m.safetensors", METADATA)
+    owner = onnxruntime if step == "InferenceSession" else onnxruntime.InferenceSession
+    monkeypatch.setattr(owner, step, fail)
+    with pytest.warns(RuntimeWarning, match="out of order") as caught:
+        results = [filter_matches(np.zeros((9, 2)), np.zeros((9, 2)), None, model=path) for _ in range(3)]
+    assert len(caught) == 1
+    assert {result.info["backend"] for result in results} == {"torch"}
+    with pytest.raises(BackendError, match="out of order"):
+        OnnxBackend(path).infer(*random_input(9))
 
 
 @pytest.mark.usefixtures("torch_stand_in")

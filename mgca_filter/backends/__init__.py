@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import threading
 import warnings
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ..errors import BackendError, MgcaFilterError
 from .base import Backend
@@ -12,6 +16,10 @@ from .onnx_backend import OnnxBackend, Providers
 from .torch_backend import TorchBackend
 
 BACKENDS = ("auto", "onnxruntime", "torch")
+_PROBE_MATCHES = 16
+
+_open_backends: dict[tuple[Any, ...], Backend] = {}
+_open_lock = threading.Lock()
 
 __all__ = [
     "BACKENDS",
@@ -23,6 +31,7 @@ __all__ = [
     "Providers",
     "TorchBackend",
     "open_backend",
+    "shared_backend",
 ]
 
 
@@ -44,7 +53,11 @@ def open_backend(path: Path, backend: str = "auto", providers: Providers | None 
     if backend == "torch" or (backend == "auto" and path == weights):
         return TorchBackend(weights)
     try:
-        return OnnxBackend(path, providers)
+        opened = OnnxBackend(path, providers)
+        if backend == "auto":
+            # A session may open and still not run: better to know before the first pair.
+            opened.infer(np.zeros((1, _PROBE_MATCHES, 4), np.float32), np.zeros((1, _PROBE_MATCHES, 8), np.float32))
+        return opened
     except BackendError as error:
         if backend != "auto":
             raise
@@ -54,3 +67,17 @@ def open_backend(path: Path, backend: str = "auto", providers: Providers | None 
             raise BackendError(f"no backend can be started: {error}; {fallback_error}") from fallback_error
         warnings.warn(f"mgca_filter falls back to PyTorch: {error}", RuntimeWarning, stacklevel=2)
         return fallback
+
+
+def shared_backend(path: Path, backend: str = "auto", providers: Providers | None = None) -> Backend:
+    """The open backend of a model file, opened once per process and again when the file changes.
+
+    Arguments and errors as :func:`open_backend`.
+    """
+    path = path.resolve()
+    stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
+    key = (path, stamp, backend, repr(providers))
+    with _open_lock:
+        if key not in _open_backends:
+            _open_backends[key] = open_backend(path, backend, providers)
+        return _open_backends[key]

@@ -20,7 +20,7 @@ CPU_PROVIDER = "CPUExecutionProvider"
 INPUT_NAMES = ["correspondences", "attributes"]
 OUTPUT_NAMES = ["logits", "essential"]
 # What ONNX Runtime raises for a file that is damaged or no ONNX model; anything else is the runtime's fault.
-_FILE_ERRORS = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "NoModel", "NoSuchFile", "Fail", "NotImplemented")
+_FILE_ERRORS = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "NoModel", "NoSuchFile")
 _LOG_ERRORS_ONLY = 3
 
 
