@@ -197,6 +197,7 @@ def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibra
             score = cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC
             params = usac_params(sampler, score, threshold, *limits, options.seed)
             if calibrated:
+                # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
                 M, _ = cv2.findEssentialMat(x1, x2, np.eye(3), np.eye(3), None, None, params)
             else:
                 M, _ = cv2.findFundamentalMat(x1, x2, params)
