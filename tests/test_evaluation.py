@@ -198,6 +198,17 @@ def test_gms_keeps_a_regular_shift():
     assert Selection(gms=True).apply(shuffled).mean() < 0.1
 
 
+def test_gms_rejects_points_outside_the_image(pair):
+    points2 = pair.points2.copy()
+    points2[:20] = [SIZE[0] + 300.0, SIZE[1] + 300.0]
+    points2[20:40] = [-50.0, 10.0]
+    pair = dataclasses.replace(pair, points2=points2)
+    for _ in range(20):
+        assert not Selection(gms=True).apply(pair)[:40].any()
+    nowhere = dataclasses.replace(pair, points1=pair.points1 - 5000.0)
+    assert not Selection(gms=True).apply(nowhere).any()
+
+
 def _as_pair(scene: Scene) -> ScenePair:
     everything = np.ones(len(scene.points1), dtype=bool)
     return ScenePair(

@@ -189,8 +189,14 @@ class Rival:
         return self.estimator.seeded
 
     def settings(self) -> dict[str, Any]:
-        settings = {"revision": REVISION, "selection": asdict(self.selection), "estimator": self.estimator.settings()}
-        return {**settings, "opencv": cv2.__version__} if self.selection.gms else settings
+        settings: dict[str, Any] = {
+            "revision": REVISION,
+            "selection": asdict(self.selection),
+            "estimator": self.estimator.settings(),
+        }
+        if self.selection.gms:
+            settings |= {"opencv": cv2.__version__, "gms_points": "inside the image"}
+        return settings
 
     def run(self, pair: ScenePair, seed: int) -> Answer:
         kept = self.selection.apply(pair)

@@ -107,14 +107,24 @@ class Selection:
 
 
 def _motion_statistics(pair: ScenePair) -> BoolArray:
-    """Matches (M,) that OpenCV's GMS keeps, at its defaults (no rotation, no scale, threshold factor 6)."""
+    """Matches (M,) that OpenCV's GMS keeps, at its defaults (no rotation, no scale, threshold factor 6).
+
+    Matches with a point outside its image are rejected: removing the distortion moves points there, and GMS would
+    write past the end of its grid.
+    """
+    rows = np.flatnonzero(_inside_image(pair.points1, pair.image_size1) & _inside_image(pair.points2, pair.image_size2))
     convert: Any = cv2.KeyPoint.convert  # takes arrays, which its annotation does not know
-    keypoints1, keypoints2 = (convert(points.astype(np.float32)) for points in (pair.points1, pair.points2))
-    matches = [cv2.DMatch(i, i, 0.0) for i in range(len(pair.points1))]
-    kept = np.zeros(len(matches), dtype=bool)
+    keypoints1, keypoints2 = (convert(points[rows].astype(np.float32)) for points in (pair.points1, pair.points2))
+    matches = [cv2.DMatch(i, i, 0.0) for i in range(len(rows))]
     found = cv2.xfeatures2d.matchGMS(pair.image_size1, pair.image_size2, keypoints1, keypoints2, matches)
-    kept[[match.queryIdx for match in found]] = True
+    kept = np.zeros(len(pair.points1), dtype=bool)
+    kept[rows[[match.queryIdx for match in found]]] = True
     return kept
+
+
+def _inside_image(points: FloatArray, size: tuple[int, int]) -> BoolArray:
+    """Bool (N,), True for pixels (N, 2) between the centres of the first and the last pixel."""
+    return np.asarray(np.all((points >= 0) & (points <= np.array(size) - 1.0), axis=1))
 
 
 @dataclass(frozen=True)
