@@ -18,6 +18,7 @@ class NetworkConfig:
         clusters: nodes of the order-aware block.
         stages: iterations of the network, each with its own weights (the paper's "Iter" switch).
         neighbours: k of the graph block, a multiple of 3 (annular convolution eats three at a time).
+        graph_expansion: width of the graph block's branches in multiples of C; 2 in the published code.
         attention: CPA as in the published code ("channel", C x C, linear in N) or the text ("point", N x N).
         positional: the positional term of CPA.
         cga: context graph attention; replaced by the identity when False (the paper's ablation).
@@ -32,6 +33,7 @@ class NetworkConfig:
     clusters: int = 128
     stages: int = 2
     neighbours: int = 6
+    graph_expansion: int = 1
     attention: Literal["channel", "point"] = "channel"
     positional: bool = True
     cga: bool = True
@@ -48,8 +50,8 @@ class NetworkConfig:
             raise ValueError(f"neighbours must be a positive multiple of 3, not {self.neighbours}")
         if self.stages not in (1, 2, 3):
             raise ValueError(f"stages must be 1, 2 or 3, not {self.stages}")
-        if self.clusters < 1:
-            raise ValueError(f"clusters must be positive, not {self.clusters}")
+        if self.clusters < 1 or self.graph_expansion < 1:
+            raise ValueError("clusters and graph_expansion must be positive")
         if self.attention not in ("channel", "point"):
             raise ValueError(f"attention must be 'channel' or 'point', not {self.attention!r}")
 
@@ -84,5 +86,5 @@ class NetworkConfig:
 
 PRESETS = {
     "small": NetworkConfig(),
-    "paper": NetworkConfig(channels=128, clusters=500, stages=3),
+    "paper": NetworkConfig(channels=128, clusters=500, stages=3, graph_expansion=2),
 }

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .point_cn import ChannelBatchNorm, ContextNorm, LinearNorm
+from .point_cn import ChannelBatchNorm, ContextNorm, LinearNorm, NormLinear
 
 RING = 3  # neighbours that one annular kernel covers
 _FAR = 1e30
@@ -100,12 +100,12 @@ class AnnularConvolution(nn.Module):
 class EdgeMaximum(nn.Module):
     """Context norm → BN → ReLU → 1x1 conv of each edge, then the maximum over the neighbours."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, outputs: int) -> None:
         super().__init__()
         self.centre_norm = ContextNorm(channels)
         self.difference_norm = ContextNorm(channels, dims=(1, 2))
-        self.centre = nn.Linear(channels, channels)
-        self.difference = nn.Linear(channels, channels, bias=False)
+        self.centre = nn.Linear(channels, outputs)
+        self.difference = nn.Linear(channels, outputs, bias=False)
 
     def forward(self, x: Tensor, indices: Tensor) -> Tensor:
         difference = x.unsqueeze(2) - gather_rows(x, indices)  # (B, N, k, C)
@@ -132,15 +132,22 @@ class AttentionalFusion(nn.Module):
 
 
 class GraphBlock(nn.Module):
-    """GNN block: annular convolution and edge maximum over k neighbours, joined by attentional fusion."""
+    """GNN block: annular convolution and edge maximum over k neighbours, joined by attentional fusion.
 
-    def __init__(self, channels: int, k: int) -> None:
+    Both branches are ``expansion`` C wide (2 in the published code) and reduced to C before the fusion.
+    """
+
+    def __init__(self, channels: int, k: int, expansion: int = 1) -> None:
         super().__init__()
         self.k = k
-        self.annular = AnnularConvolution(channels, channels, graphs=1, k=k)
-        self.maximum = EdgeMaximum(channels)
+        width = expansion * channels
+        self.annular = AnnularConvolution(channels, width, graphs=1, k=k)
+        self.maximum = EdgeMaximum(channels, width)
+        self.reduce1 = NormLinear(width, channels) if expansion > 1 else nn.Identity()
+        self.reduce2 = NormLinear(width, channels) if expansion > 1 else nn.Identity()
         self.fusion = AttentionalFusion(channels)
 
     def forward(self, x: Tensor) -> Tensor:
         indices = nearest_neighbours(x, self.k)  # (B, N, k)
-        return self.fusion(self.annular([x], [indices]), self.maximum(x, indices))
+        annular = self.reduce1(self.annular([x], [indices]))
+        return self.fusion(annular, self.reduce2(self.maximum(x, indices)))

@@ -5,19 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from .point_cn import ChannelBatchNorm, ContextNorm
-
-
-class _NormalizedLinear(nn.Module):
-    """Context norm → BN → ReLU → 1x1 conv."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.norm = ContextNorm(inputs)
-        self.linear = nn.Linear(inputs, outputs)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.linear(F.relu(self.norm(x)))
+from .point_cn import ChannelBatchNorm, NormLinear
 
 
 class OrderAwareFilter(nn.Module):
@@ -25,10 +13,10 @@ class OrderAwareFilter(nn.Module):
 
     def __init__(self, channels: int, clusters: int) -> None:
         super().__init__()
-        self.channel1 = _NormalizedLinear(channels, channels)
+        self.channel1 = NormLinear(channels, channels)
         self.cluster_norm = ChannelBatchNorm(clusters)
         self.cluster = nn.Linear(clusters, clusters)
-        self.channel2 = _NormalizedLinear(channels, channels)
+        self.channel2 = NormLinear(channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
         y = self.channel1(x)  # (B, clusters, C)
@@ -47,9 +35,9 @@ class OrderAwareBlock(nn.Module):
 
     def __init__(self, channels: int, clusters: int, filters: int = 3) -> None:
         super().__init__()
-        self.pool = _NormalizedLinear(channels, clusters)
+        self.pool = NormLinear(channels, clusters)
         self.filters = nn.Sequential(*[OrderAwareFilter(channels, clusters) for _ in range(filters)])
-        self.unpool = _NormalizedLinear(channels, clusters)
+        self.unpool = NormLinear(channels, clusters)
 
     def forward(self, x: Tensor) -> Tensor:
         assignment = self.pool(x).transpose(1, 2).float().softmax(-1)  # (B, clusters, N)

@@ -62,6 +62,18 @@ class LinearNorm(nn.Module):
         return self.norm(self.linear(x))
 
 
+class NormLinear(nn.Module):
+    """Context norm → BN → ReLU → 1x1 conv, the building block of the OANet family."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.norm = ContextNorm(inputs)
+        self.linear = nn.Linear(inputs, outputs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.linear(F.relu(self.norm(x)))
+
+
 class PointCN(nn.Module):
     """[context norm → BN → GELU → 1x1 conv] twice, plus a shortcut (1x1 conv where the width changes)."""
 
