@@ -31,7 +31,8 @@ def nearest_neighbours(features: Tensor, k: int) -> Tensor:
     penalty = F.pad(0.5 * x.square().sum(-1, keepdim=True), (0, 0, 0, k), value=_FAR)
     keys = torch.cat([F.pad(x, (0, 0, 0, k)), -penalty], -1)  # (B, N + k, C + 1)
     queries = torch.cat([x, torch.ones_like(x[..., :1])], -1)
-    nearness = queries @ keys.transpose(1, 2)  # (B, N, N + k)
+    with torch.autocast(x.device.type, enabled=False):  # neighbours must not depend on the training precision
+        nearness = queries @ keys.transpose(1, 2)  # (B, N, N + k)
     indices = nearness.topk(k, dim=-1).indices
     own = torch.arange(count, device=x.device).view(1, -1, 1)
     return torch.where(indices < count, indices, own)

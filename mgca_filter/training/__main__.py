@@ -1,14 +1,20 @@
-"""``python -m mgca_filter.training --config FILE --data FOLDER --run FOLDER``"""
+"""``python -m mgca_filter.training --config FILE --data FOLDER --run-dir FOLDER``
+
+Several GPUs, or a CPU whose cores idle on matrices this small:
+``torchrun --nproc-per-node 2 -m mgca_filter.training …`` (one thread each: ``OMP_NUM_THREADS=1``).
+"""
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import torch
+import torch.distributed as dist
 
 from ..errors import MgcaFilterError
 from ..scene_bundle import SceneBundle, load_scene_bundles
@@ -37,7 +43,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser = argparse.ArgumentParser(prog="python -m mgca_filter.training", description="Train MGCA-Net.")
     parser.add_argument("--config", type=Path, required=True, help="TOML file, e.g. mgca_filter/training/configs/small.toml")
     parser.add_argument("--data", type=Path, required=True, help="folder of scene bundles (.npz)")
-    parser.add_argument("--run", type=Path, required=True, help="run directory; a checkpoint in it is resumed")
+    parser.add_argument("--run-dir", type=Path, required=True, help="run directory; a checkpoint in it is resumed")
     parser.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--workers", type=int, default=1, help="processes that prepare batches (0 = none)")
@@ -47,20 +53,32 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     return parser.parse_args(arguments)
 
 
+def _join_processes(options: argparse.Namespace) -> tuple[int, int]:
+    """Rank and number of processes; under torchrun, join them and take this process's GPU."""
+    if "WORLD_SIZE" not in os.environ:
+        return 0, 1
+    if options.device == "cuda":
+        options.device = f"cuda:{os.environ['LOCAL_RANK']}"
+        torch.cuda.set_device(options.device)
+    dist.init_process_group("nccl" if options.device.startswith("cuda") else "gloo")
+    return dist.get_rank(), dist.get_world_size()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = done, 1 = diverged, 2 = config or data cannot be used."""
     options = parse_arguments(arguments)
+    shard = _join_processes(options)
     try:
         config = load_config(options.config)
         training, tuning = split_scenes(load_scene_bundles(options.data), config)
         dataset = SceneBundleDataset(
-            training, config.sampling, config.augmentation, config.seed, config.schedule.steps
+            training, config.sampling, config.augmentation, config.seed, config.schedule.steps, shard
         )
         validate = partial(quick_validation, pairs=select_pairs(tuning or training, options.validate_pairs))
         trainer = Trainer(
             config,
             dataset,
-            options.run,
+            options.run_dir,
             validate,
             options.validate_every,
             options.device,

@@ -78,7 +78,10 @@ def is_held_out(pair_index: int, holdout_every: int) -> bool:
 
 
 class SceneBundleDataset(Dataset[dict[str, Tensor]]):
-    """Item ``step`` is the whole batch of that step; workers and resumes change nothing about it."""
+    """Item ``step`` is the whole batch of that step; workers and resumes change nothing about it.
+
+    Of several processes each takes its share of the batch: ``shard`` is (rank, number of processes).
+    """
 
     def __init__(
         self,
@@ -87,6 +90,7 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         augmentation: AugmentationConfig,
         seed: int,
         steps: int,
+        shard: tuple[int, int] = (0, 1),
     ) -> None:
         if not bundles:
             raise ValueError("no scene bundles to train on")
@@ -95,6 +99,9 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         self.augmentation = augmentation
         self.seed = seed
         self.steps = steps
+        self.rank, self.world = shard
+        if sampling.batch_size % self.world:
+            raise ValueError(f"a batch of {sampling.batch_size} pairs does not divide among {self.world} processes")
         self.pairs = [
             [index for index in range(len(bundle)) if not is_held_out(index, sampling.holdout_every)]
             for bundle in self.bundles
@@ -116,7 +123,7 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         weights = np.array(self.sampling.matches_weights)
         count = int(rng.choice(self.sampling.matches, p=weights / weights.sum()))
         count = min([count] + [len(draw.rows) for draw in batch])
-        samples = [self.build_sample(draw, count) for draw in batch]
+        samples = [self.build_sample(draw, count) for draw in batch[self.rank :: self.world]]
         return {name: torch.from_numpy(np.stack([s[name] for s in samples])) for name in samples[0]}
 
     def _draw_pool(self, pool: int) -> tuple[list[Draw], NDArray[np.intp]]:

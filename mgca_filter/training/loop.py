@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
@@ -75,15 +77,19 @@ class Trainer:
         if initial_weights is not None:
             self.network.load_state_dict(load_network(initial_weights).state_dict())
         self.network.to(self.device)
+        # Started by torchrun, each process holds a share of the batch and gradients are averaged.
+        self.model = DistributedDataParallel(self.network) if dist.is_initialized() else self.network
+        self.is_main = not dist.is_initialized() or dist.get_rank() == 0
         self.average = deepcopy(self.network).requires_grad_(False)
         self.optimizer = _optimizer(self.network, config.schedule)
         folder.mkdir(parents=True, exist_ok=True)
         self.step = 0
         if (folder / CHECKPOINT).is_file():
             self.step = restore_checkpoint(folder / CHECKPOINT, config, self.network, self.average, self.optimizer)
-        for name in (LOG, VALIDATION):
-            _drop_rows_after(folder / name, self.step)
-        (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
+        if self.is_main:
+            for name in (LOG, VALIDATION):
+                _drop_rows_after(folder / name, self.step)
+            (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
 
     def run(self, stop_after: int | None = None) -> None:
         """Train to the end of the schedule, or for ``stop_after`` steps."""
@@ -97,18 +103,21 @@ class Trainer:
             num_workers=self.workers,
             prefetch_factor=4 if self.workers else None,
         )
-        with tqdm(total=self.config.schedule.steps, initial=self.step, unit="step", smoothing=0.05) as progress:
+        total = self.config.schedule.steps
+        with tqdm(total=total, initial=self.step, unit="step", smoothing=0.05, disable=not self.is_main) as progress:
             clock = time.perf_counter()
             for batch in loader:
                 figures = self._train_step({name: tensor.to(self.device) for name, tensor in batch.items()})
                 self.step += 1
                 progress.update()
+                if not self.is_main:
+                    continue
                 if self.step % LOG_EVERY == 0:
                     seconds, clock = time.perf_counter() - clock, time.perf_counter()
                     figures["samples_per_s"] = LOG_EVERY * self.config.sampling.batch_size / seconds
                     _append_row(self.folder / LOG, {"step": self.step, **figures})
                     progress.set_postfix(loss=f"{figures['loss']:.3f}", recall=f"{figures['recall']:.2f}")
-                if self.step % self.validate_every == 0 or self.step == self.config.schedule.steps:
+                if self.step % self.validate_every == 0 or self.step == total:
                     _append_row(self.folder / VALIDATION, {"step": self.step, **self.validate(self.average)})
                 if self.step % SAVE_EVERY == 0 or self.step == last:
                     self.save()
@@ -130,7 +139,7 @@ class Trainer:
         geometric = schedule.geometric_weight if self.step >= schedule.geometric_from * schedule.steps else 0.0
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=schedule.precision == "bf16"):
-            output = self.network(batch["correspondences"], batch["attributes"])
+            output = self.model(batch["correspondences"], batch["attributes"])
         loss, parts = network_loss(output, batch, geometric)
         if self.network.prior is not None:
             prior = self.network.prior(batch["prior_attributes"])
@@ -158,7 +167,8 @@ class Trainer:
                 mine.copy_(new)
 
     def _stop(self, batch: dict[str, Tensor], reason: str) -> None:
-        path = self.folder / f"diverged_{self.step}.pt"
+        rank = dist.get_rank() if dist.is_initialized() else 0
+        path = self.folder / f"diverged_{self.step}_{rank}.pt"
         torch.save(batch, path)
         raise DivergedError(f"step {self.step}: {reason}; the batch lies in {path}")
 

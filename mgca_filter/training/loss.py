@@ -42,9 +42,7 @@ def network_loss(
     for head in output.heads:
         classification = balanced_cross_entropy(head.logits, batch["labels"])
         geometry = geometric_loss(head.essential, batch["virtual"], batch["virtual_valid"])
-        total = total + classification
-        if geometric_weight > 0:
-            total = total + geometric_weight * geometry
+        total = total + classification + geometric_weight * geometry
     return total, {"classification": classification.detach(), "geometric": geometry.detach()}
 
 
