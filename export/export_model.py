@@ -7,12 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+from parity import check_parity, format_parity
+
 import mgca_filter
 from mgca_filter.calibration import Calibration
 from mgca_filter.network import load_network
 from mgca_filter.onnx_export import ModelDescription, export_model
-
-from parity import check_parity, format_parity
 
 ROOT = Path(__file__).resolve().parent.parent
 WEIGHTS_LICENSE = (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
 from mgca_filter.backends import Backend, open_backend
 
 COUNTS = (1, 2, 7, 8, 9, 16, 127, 512, 2000)

@@ -73,7 +73,6 @@ def fold_batch_norm(network: MGCANet) -> MGCANet:
 @torch.no_grad()
 def _folded(layer: LinearNorm) -> nn.Linear:
     norm = layer.norm
-    assert norm.running_var is not None and norm.running_mean is not None
     scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
     linear = nn.Linear(layer.linear.in_features, layer.linear.out_features)
     linear.weight.copy_(layer.linear.weight * scale[:, None])

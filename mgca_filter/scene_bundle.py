@@ -14,9 +14,10 @@ from .epipolar import essential_from_pose
 from .errors import BundleError
 
 _FIELDS = (
-    "image_name image_size K R t keypoint_offset keypoint_xy keypoint_size keypoint_angle pair match_offset "
-    "match_index match_ratio match_mutual match_best covisible"
-).split()
+    *("image_name", "image_size", "K", "R", "t"),
+    *("keypoint_offset", "keypoint_xy", "keypoint_size", "keypoint_angle"),
+    *("pair", "match_offset", "match_index", "match_ratio", "match_mutual", "match_best", "covisible"),
+)
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ class NetworkConfig:
         unknown = set(values) - {field.name for field in fields(cls)}
         if unknown:
             raise ValueError(f"unknown network option: {', '.join(sorted(unknown))}")
-        return cls(**{**asdict(base), **values})  # type: ignore[arg-type]
+        return cls(**{**asdict(base), **values})
 
 
 PRESETS = {

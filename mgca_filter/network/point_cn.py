@@ -14,11 +14,14 @@ BATCH_NORM_MOMENTUM = 0.1
 class ChannelBatchNorm(nn.BatchNorm1d):
     """BatchNorm over the last axis of (..., C): every match of every pair is one sample."""
 
+    running_mean: Tensor
+    running_var: Tensor
+
     def forward(self, x: Tensor) -> Tensor:
         if self.training:
             return super().forward(x.reshape(-1, x.shape[-1])).reshape(x.shape)
-        scale = self.weight * torch.rsqrt(self.running_var + self.eps)  # type: ignore[operator]
-        return x * scale + (self.bias - self.running_mean * scale)  # type: ignore[operator]
+        scale = self.weight * torch.rsqrt(self.running_var + self.eps)
+        return x * scale + (self.bias - self.running_mean * scale)
 
 
 class ContextNorm(nn.Module):
@@ -30,6 +33,8 @@ class ContextNorm(nn.Module):
     norms together cost one pass. ``dims`` are the axes that hold matches: 1 for (B, N, C), 1 and 2 for
     edges (B, N, k, C).
     """
+
+    running_var: Tensor
 
     def __init__(self, channels: int, dims: tuple[int, ...] = (1,)) -> None:
         super().__init__()

@@ -41,7 +41,7 @@ def split_scenes(bundles: Sequence[SceneBundle], config: TrainingConfig) -> tupl
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m mgca_filter.training", description="Train MGCA-Net.")
-    parser.add_argument("--config", type=Path, required=True, help="TOML file, e.g. mgca_filter/training/configs/small.toml")
+    parser.add_argument("--config", type=Path, required=True, help="TOML file, such as training/configs/small.toml")
     parser.add_argument("--data", type=Path, required=True, help="folder of scene bundles (.npz)")
     parser.add_argument("--run-dir", type=Path, required=True, help="run directory; a checkpoint in it is resumed")
     parser.add_argument("--init", type=Path, help="weights (.safetensors) to start from")

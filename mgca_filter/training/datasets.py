@@ -188,9 +188,7 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         }
 
 
-def _filtered_rows(
-    rng: np.random.Generator, pair: ScenePair, attributes: NDArray[np.float32]
-) -> NDArray[np.intp]:
+def _filtered_rows(rng: np.random.Generator, pair: ScenePair, attributes: NDArray[np.float32]) -> NDArray[np.intp]:
     """Rows that a user's own filter would have left: a ratio test, a cross-check, or both."""
     kind = int(rng.integers(3))
     keep = np.ones(len(attributes), dtype=bool)

@@ -124,9 +124,7 @@ class Trainer:
 
     def save(self) -> None:
         """Write checkpoint and averaged weights."""
-        save_checkpoint(
-            self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer
-        )
+        save_checkpoint(self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer)
         save_network(self.average, self.folder / WEIGHTS, {"name": self.config.name, "steps": str(self.step)})
 
     def _train_step(self, batch: dict[str, Tensor]) -> dict[str, float]:

@@ -50,9 +50,9 @@ def _evaluate_pair(network: MGCANet, pair: ScenePair) -> tuple[float, float, flo
     output = network(torch.from_numpy(x.astype(np.float32))[None], torch.from_numpy(attributes)[None])
     logits = output.logits[0].numpy()
     truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < LABEL_DISTANCE
-    right = np.count_nonzero(truth[rows] & (logits > 0))
-    precision = right / max(np.count_nonzero(logits > 0), 1)
-    recall = right / max(np.count_nonzero(truth), 1)
+    right = int(np.count_nonzero(truth[rows] & (logits > 0)))
+    precision = right / max(int(np.count_nonzero(logits > 0)), 1)
+    recall = right / max(int(np.count_nonzero(truth)), 1)
     scores = 1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0)))
     order = match_order(scores.astype(np.float32), attributes[:, 0], attributes[:, 5] > 0)
     kept = order[logits[order] > 0]
