@@ -8,6 +8,8 @@ from torch import Tensor, nn
 
 from mgca_filter.network import MGCANet, NetworkConfig
 
+torch.set_num_threads(1)  # networks this small only lose by sharing the work
+
 TINY = NetworkConfig(channels=8, clusters=8, stages=2)
 
 

@@ -64,9 +64,11 @@ class NetworkConfig:
         """Inverse of :meth:`to_json`.
 
         Raises:
-            ValueError: the text is no JSON object or names a field that is not there.
+            ValueError: the text is no JSON object, or a field is not there or of another type.
         """
         values = json.loads(text)
+        if not isinstance(values, dict):
+            raise ValueError(f"expected a JSON object, got {text!r}")
         return cls.from_dict(values)
 
     @classmethod
@@ -74,13 +76,20 @@ class NetworkConfig:
         """A config from field names and values; ``preset`` names what the others are changes to.
 
         Raises:
-            ValueError: a field is not there.
+            ValueError: a field or preset is not there, or a value has another type.
         """
         values = dict(values)
-        base = PRESETS[str(values.pop("preset"))] if "preset" in values else cls()
+        preset = values.pop("preset", None)
+        if preset is not None and preset not in PRESETS:
+            raise ValueError(f"preset: expected one of {', '.join(PRESETS)}, got {preset!r}")
+        base = cls() if preset is None else PRESETS[str(preset)]
         unknown = set(values) - {field.name for field in fields(cls)}
         if unknown:
             raise ValueError(f"unknown network option: {', '.join(sorted(unknown))}")
+        for name, value in values.items():
+            kind = type(getattr(base, name))
+            if type(value) is not kind:
+                raise ValueError(f"{name}: expected {kind.__name__}, got {value!r}")
         return cls(**{**asdict(base), **values})
 
 

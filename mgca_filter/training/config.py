@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ..network import NetworkConfig
 from .augmentation import AugmentationConfig
@@ -80,13 +80,18 @@ def load_config(path: str | Path) -> TrainingConfig:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path}: {error}") from error
     tables = {"sampling": SamplingConfig, "augmentation": AugmentationConfig, "schedule": ScheduleConfig}
+    for name in ("network", *tables):
+        if not isinstance(values.get(name, {}), dict):
+            raise ConfigError(f"{path}: {name}: expected a table, got {values[name]!r}")
     try:
-        network = NetworkConfig.from_dict(values.pop("network", {}))
-    except (KeyError, ValueError) as error:
-        raise ConfigError(f"{path}: network: {error}") from error
-    parsed: dict[str, Any] = {"network": network}
-    for name, kind in tables.items():
-        parsed[name] = kind(**_checked(path, name, kind, values.pop(name, {})))
+        name = "network"
+        parsed: dict[str, Any] = {name: NetworkConfig.from_dict(values.pop(name, {}))}
+        for name, kind in tables.items():
+            parsed[name] = kind(**_checked(path, name, kind, values.pop(name, {})))
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(f"{path}: {name}: {error}") from error
     rest = _checked(path, "", TrainingConfig, values)
     if "name" not in rest:
         raise ConfigError(f"{path}: name: missing")
@@ -95,17 +100,29 @@ def load_config(path: str | Path) -> TrainingConfig:
 
 def _checked(path: Path, table: str, kind: type, values: dict[str, Any]) -> dict[str, Any]:
     """Values whose keys and types are those of the dataclass ``kind``; lists become tuples."""
-    defaults = {f.name: f.default for f in fields(kind)}
+    hints = get_type_hints(kind)
     checked = {}
     for key, value in values.items():
         where = f"{table}.{key}" if table else key
-        if key not in defaults:
+        if key not in hints:
             raise ConfigError(f"{path}: {where}: unknown key")
-        value = tuple(value) if isinstance(value, list) else value
-        default = defaults[key]
-        if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
-        if isinstance(default, (int, float, str, tuple)) and type(value) is not type(default):
-            raise ConfigError(f"{path}: {where}: expected {type(default).__name__}, got {value!r}")
-        checked[key] = value
+        hint = hints[key]
+        if get_origin(hint) is Literal:
+            if value not in get_args(hint):
+                raise ConfigError(f"{path}: {where}: expected one of {', '.join(get_args(hint))}, got {value!r}")
+            checked[key] = value
+        elif get_origin(hint) is tuple:
+            if not isinstance(value, list):
+                raise ConfigError(f"{path}: {where}: expected a list, got {value!r}")
+            checked[key] = tuple(_scalar(path, where, get_args(hint)[0], item) for item in value)
+        else:
+            checked[key] = _scalar(path, where, hint, value)
     return checked
+
+
+def _scalar(path: Path, where: str, kind: type, value: Any) -> Any:
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise ConfigError(f"{path}: {where}: expected {kind.__name__}, got {value!r}")
+    return value

@@ -59,6 +59,16 @@ class SamplingConfig:
     holdout_every: int = 40
     pool_batches: int = 8
 
+    def __post_init__(self) -> None:
+        if not self.matches or len(self.matches) != len(self.matches_weights):
+            raise ValueError("matches and matches_weights must be equally long")
+        if min(self.batch_size, self.pool_batches, *self.matches) < 1:
+            raise ValueError("batch_size, pool_batches and matches must be positive")
+        for names in (("candidates", "filtered", "bare"), ("matches_weights",)):
+            weights = np.hstack([getattr(self, name) for name in names])
+            if weights.min() < 0 or weights.sum() <= 0:
+                raise ValueError(f"{', '.join(names)} must be non-negative and not all zero")
+
 
 @dataclass(frozen=True)
 class Draw:

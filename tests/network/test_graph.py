@@ -73,7 +73,9 @@ def edges(x: Tensor, indices: Tensor) -> Tensor:
     return torch.cat([centres, centres - neighbours], -1).permute(0, 3, 1, 2)
 
 
-@pytest.mark.parametrize(("graphs", "k", "count"), [(1, 6, 20), (1, 3, 20), (3, 3, 20), (4, 3, 9), (3, 2, 20), (1, 6, 4)])
+@pytest.mark.parametrize(
+    ("graphs", "k", "count"), [(1, 6, 20), (1, 3, 20), (3, 3, 20), (4, 3, 9), (3, 2, 20), (1, 6, 4)]
+)
 def test_annular_convolution_is_a_convolution_of_edges(graphs, k, count):
     torch.manual_seed(graphs)
     channels, outputs = 6, 8
