@@ -79,17 +79,52 @@ class SceneBundle:
             raise
         except Exception as error:  # zipfile, zlib, numpy and the system each have their own
             raise BundleError(f"{self.path}: cannot be read as a scene bundle ({error})") from error
+        self._check_shapes()
         count = int(self._data["match_offset"][-1])
         for field in ("match_mutual", "match_best"):
             self._data[field] = np.unpackbits(self._data[field], count=count).astype(bool)
-        self._check()
+        self._check_values()
 
-    def _check(self) -> None:
+    def _check_shapes(self) -> None:
         d = self._data
-        pairs, matches = len(d["pair"]), int(d["match_offset"][-1])
-        if len(d["match_offset"]) != pairs + 1 or len(d["match_index"]) != matches or len(d["match_ratio"]) != matches:
-            raise BundleError(f"{self.path}: match_offset does not fit pair, match_index or match_ratio")
-        if pairs and int(d["pair"].max()) >= len(d["R"]):
+        images, pairs = (len(np.atleast_1d(d[field])) for field in ("R", "pair"))
+        shapes: dict[str, tuple[int, ...]] = {
+            "image_name": (images,),
+            "image_size": (images, 2),
+            "K": (images, 3, 3),
+            "R": (images, 3, 3),
+            "t": (images, 3),
+            "keypoint_offset": (images + 1,),
+            "pair": (pairs, 2),
+            "match_offset": (pairs + 1,),
+        }
+        for field, shape in shapes.items():
+            if d[field].shape != shape:
+                raise BundleError(f"{self.path}: {field} has the shape {d[field].shape} instead of {shape}")
+        for field in ("keypoint_offset", "match_offset"):
+            offset = d[field].astype(np.int64)
+            if offset[0] != 0 or (np.diff(offset) < 0).any():
+                raise BundleError(f"{self.path}: {field} does not rise from 0")
+        keypoints, matches = (int(d[field][-1]) for field in ("keypoint_offset", "match_offset"))
+        lengths: dict[str, tuple[int, ...]] = {
+            "keypoint_xy": (keypoints, 2),
+            "keypoint_size": (keypoints,),
+            "keypoint_angle": (keypoints,),
+            "match_index": (matches,),
+            "match_ratio": (matches,),
+            "match_mutual": ((matches + 7) // 8,),
+            "match_best": ((matches + 7) // 8,),
+        }
+        for field, shape in lengths.items():
+            if d[field].shape != shape:
+                raise BundleError(f"{self.path}: {field} has the shape {d[field].shape}, its offsets promise {shape}")
+        for field in ("match_mutual", "match_best"):
+            if d[field].dtype != np.uint8:
+                raise BundleError(f"{self.path}: {field} is not packed into bytes (np.packbits)")
+
+    def _check_values(self) -> None:
+        d = self._data
+        if len(d["pair"]) and not 0 <= int(d["pair"].min()) <= int(d["pair"].max()) < len(d["R"]):
             raise BundleError(f"{self.path}: pair names an image that is not there")
         for field in ("K", "R", "t", "keypoint_xy"):
             if not np.isfinite(d[field]).all():
@@ -97,6 +132,10 @@ class SceneBundle:
         eye = d["R"] @ np.transpose(d["R"], (0, 2, 1))
         if len(eye) and (np.abs(eye - np.eye(3)).max() > 1e-4 or np.linalg.det(d["R"]).min() < 0):
             raise BundleError(f"{self.path}: R holds a matrix that is not a rotation")
+
+    def match_counts(self) -> NDArray[np.int64]:
+        """Number of raw matches of each pair (P,)."""
+        return np.diff(self._data["match_offset"].astype(np.int64))
 
     def __len__(self) -> int:
         return len(self._data["pair"])
@@ -111,8 +150,8 @@ class SceneBundle:
         start_i, start_j = int(d["keypoint_offset"][i]), int(d["keypoint_offset"][j])
         k1 = start_i + np.arange(count)
         k2 = start_j + d["match_index"][rows].astype(np.int64)
-        if k1[-1:] >= d["keypoint_offset"][i + 1] or (count and k2.max() >= d["keypoint_offset"][j + 1]):
-            raise BundleError(f"{self.path}: pair {index} names a keypoint that is not there")
+        if count and (k1[-1] >= d["keypoint_offset"][i + 1] or k2.max() >= d["keypoint_offset"][j + 1]):
+            raise BundleError(f"{self.path}: match_index of pair {index} names a keypoint that is not there")
         size, angle, degrees = d["keypoint_size"], d["keypoint_angle"], np.float32(360.0 / 256.0)
         R = d["R"][j] @ d["R"][i].T
         return ScenePair(

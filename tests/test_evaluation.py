@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import SIZE, K, Scene, make_scene
+from scene_bundles import write_bundle
 
 from mgca_filter import filter_matches
 from mgca_filter.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
@@ -30,34 +31,6 @@ from mgca_filter.evaluation.store import ResultStore
 from mgca_filter.scene_bundle import ScenePair
 
 PROSAC = "mutual + ratio 0.9 + PROSAC 0.5 px"
-
-
-def write_bundle(path: Path, scenes: list[Scene]) -> Path:
-    """A scene bundle with one pair of images per synthetic scene."""
-    count = [len(scene.points1) for scene in scenes]
-    per_image = np.repeat(count, 2)
-    matches = int(np.sum(count))
-    ratio = np.concatenate([scene.attributes.ratio for scene in scenes])
-    np.savez_compressed(
-        path,
-        image_name=np.array([f"{i:03d}.jpg" for i in range(2 * len(scenes))]),
-        image_size=np.tile(np.array(SIZE), (2 * len(scenes), 1)),
-        K=np.tile(K, (2 * len(scenes), 1, 1)),
-        R=np.concatenate([[np.eye(3), scene.R] for scene in scenes]),
-        t=np.concatenate([[np.zeros(3), scene.t] for scene in scenes]),
-        keypoint_offset=np.concatenate([[0], np.cumsum(per_image)]),
-        keypoint_xy=np.concatenate([p for s in scenes for p in (s.points1, s.points2)]).astype(np.float32),
-        keypoint_size=np.full(2 * matches, 4.0, dtype=np.float16),
-        keypoint_angle=np.full(2 * matches, 20, dtype=np.uint8),
-        pair=np.arange(2 * len(scenes)).reshape(-1, 2).astype(np.uint16),
-        match_offset=np.concatenate([[0], np.cumsum(count)]),
-        match_index=np.concatenate([np.arange(n) for n in count]).astype(np.uint16),
-        match_ratio=np.round(255 * ratio).astype(np.uint8),
-        match_mutual=np.packbits(np.ones(matches, dtype=bool)),
-        match_best=np.packbits(np.ones(matches, dtype=bool)),
-        covisible=np.full(len(scenes), -1),
-    )
-    return path
 
 
 @pytest.fixture(scope="module")

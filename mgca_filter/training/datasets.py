@@ -15,6 +15,7 @@ from torch.utils.data import Dataset
 
 from ..correspondences import candidate_mask
 from ..epipolar import homogeneous, symmetric_epipolar_distance_squared
+from ..errors import BundleError
 from ..scene_bundle import SceneBundle, ScenePair
 from .augmentation import (
     AugmentationConfig,
@@ -30,6 +31,7 @@ Regime = Literal["candidates", "filtered", "bare"]
 VIRTUAL_GRID = 20
 SAMPSON_STEPS = 8
 MINIMUM_POSITIVES = 8
+MINIMUM_MATCHES = 32  # pairs with fewer would cut their whole batch down
 PRIOR_MATCHES = 256
 HOLDOUT_REMAINDER = 7
 
@@ -102,8 +104,6 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         steps: int,
         shard: tuple[int, int] = (0, 1),
     ) -> None:
-        if not bundles:
-            raise ValueError("no scene bundles to train on")
         self.bundles = list(bundles)
         self.sampling = sampling
         self.augmentation = augmentation
@@ -113,11 +113,25 @@ class SceneBundleDataset(Dataset[dict[str, Tensor]]):
         if sampling.batch_size % self.world:
             raise ValueError(f"a batch of {sampling.batch_size} pairs does not divide among {self.world} processes")
         self.pairs = [
-            [index for index in range(len(bundle)) if not is_held_out(index, sampling.holdout_every)]
+            [
+                index
+                for index, count in enumerate(bundle.match_counts())
+                if count >= MINIMUM_MATCHES and not is_held_out(index, sampling.holdout_every)
+            ]
             for bundle in self.bundles
         ]
-        weights = np.array([len(pairs) for pairs in self.pairs], dtype=np.float64) ** sampling.scene_exponent
+        sizes = np.array([len(pairs) for pairs in self.pairs], dtype=np.float64)
+        if not sizes.any():
+            raise BundleError(f"no pair with {MINIMUM_MATCHES} matches or more to train on")
+        weights = np.where(sizes > 0, np.maximum(sizes, 1.0) ** sampling.scene_exponent, 0.0)
         self.scene_probability = weights / weights.sum()
+        self._pool = lru_cache(maxsize=1)(self._draw_pool)
+
+    def __getstate__(self) -> dict[str, object]:
+        return {name: value for name, value in vars(self).items() if name != "_pool"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        vars(self).update(state)
         self._pool = lru_cache(maxsize=1)(self._draw_pool)
 
     def __len__(self) -> int:

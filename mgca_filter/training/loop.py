@@ -188,9 +188,13 @@ def _append_row(path: Path, row: dict[str, Any]) -> None:
 
 
 def _drop_rows_after(path: Path, step: int) -> None:
-    """Forget what a killed run logged beyond its last checkpoint."""
+    """Forget what a killed run logged beyond its last checkpoint, and a last row that it left unfinished."""
     if not path.is_file():
         return
-    header, *rows = path.read_text(encoding="utf-8").splitlines()
-    kept = [row for row in rows if int(row.split(",", 1)[0]) <= step]
+    header, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
+    if step == 0 or not header:
+        path.unlink()
+        return
+    whole = [row for row in rows if row.count(",") == header.count(",")]
+    kept = [row for row in whole if int(row.split(",", 1)[0]) <= step]
     path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
