@@ -28,14 +28,18 @@ def split_scenes(bundles: Sequence[SceneBundle], config: TrainingConfig) -> tupl
     """Training and tuning bundles.
 
     Raises:
-        ConfigError: a tuning scene is not among the bundles.
+        ConfigError: a scene that the config names is not among the bundles, or no scene is left to train on.
     """
     names = {bundle.scene for bundle in bundles}
-    missing = [scene for scene in config.tuning_scenes if scene not in names]
-    if missing:
-        raise ConfigError(f"tuning_scenes: not in the data folder: {', '.join(missing)}")
+    for key, wanted in (("scenes", config.scenes), ("tuning_scenes", config.tuning_scenes)):
+        missing = [scene for scene in wanted if scene not in names]
+        if missing:
+            raise ConfigError(f"{key}: not in the data folder: {', '.join(missing)}")
+    chosen = names.intersection(config.scenes or names).difference(config.tuning_scenes)
+    if not chosen:
+        raise ConfigError("scenes: nothing is left to train on besides tuning_scenes")
     tuning = [bundle for bundle in bundles if bundle.scene in config.tuning_scenes]
-    return [bundle for bundle in bundles if bundle.scene not in config.tuning_scenes], tuning
+    return [bundle for bundle in bundles if bundle.scene in chosen], tuning
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:

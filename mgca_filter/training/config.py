@@ -53,10 +53,15 @@ class ScheduleConfig:
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Everything a run depends on besides the data itself."""
+    """Everything a run depends on besides the data itself.
+
+    ``scenes`` names the bundles to train on; empty = all that the data folder holds. ``tuning_scenes`` are kept
+    out of training: what is chosen often is chosen on them.
+    """
 
     name: str
     seed: int = 0
+    scenes: tuple[str, ...] = ()
     tuning_scenes: tuple[str, ...] = ()
     network: NetworkConfig = field(default_factory=NetworkConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
