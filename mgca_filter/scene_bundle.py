@@ -135,7 +135,8 @@ class SceneBundle:
 
     def match_counts(self) -> NDArray[np.int64]:
         """Number of raw matches of each pair (P,)."""
-        return np.diff(self._data["match_offset"].astype(np.int64))
+        counts: NDArray[np.int64] = np.diff(self._data["match_offset"].astype(np.int64))
+        return counts
 
     def __len__(self) -> int:
         return len(self._data["pair"])
