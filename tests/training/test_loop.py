@@ -1,0 +1,277 @@
+"""The training loop on a tiny bundle: bit-for-bit repeatable, resumable, and stopped by NaN."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import make_scene
+from networks import TINY, tiny_network
+from scene_bundles import write_bundle
+
+from mgca_filter.network import MGCANet, load_network, save_network
+from mgca_filter.network.weights import read_metadata
+from mgca_filter.scene_bundle import SceneBundle
+from mgca_filter.training import loop
+from mgca_filter.training.__main__ import main
+from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig
+from mgca_filter.training.datasets import SamplingConfig, SceneBundleDataset
+from mgca_filter.training.loop import CHECKPOINT, DivergedError, Trainer, learning_rate
+from mgca_filter.training.validation import quick_validation, select_pairs
+
+STEPS = 6
+CONFIG = TrainingConfig(
+    name="tiny",
+    seed=5,
+    network=TINY,
+    sampling=SamplingConfig(batch_size=2, matches=(32,), matches_weights=(1.0,), holdout_every=0, pool_batches=2),
+    schedule=ScheduleConfig(steps=STEPS, warmup_steps=2, geometric_from=0.5, precision="fp32"),
+)
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> SceneBundle:
+    path = tmp_path_factory.mktemp("data") / "hall.npz"
+    return SceneBundle(write_bundle(path, [make_scene(seed=seed, right=60, wrong=40) for seed in range(3)]))
+
+
+@pytest.fixture(autouse=True)
+def _log_every_second_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "LOG_EVERY", 2)
+    monkeypatch.setattr(loop, "SAVE_EVERY", 2)
+
+
+def fingerprint(network: MGCANet) -> dict[str, float]:
+    return {"weights": sum(float(parameter.double().abs().sum()) for parameter in network.parameters())}
+
+
+def trainer(
+    bundle: SceneBundle, folder: Path, config: TrainingConfig = CONFIG, weights: Path | None = None
+) -> Trainer:
+    dataset = SceneBundleDataset(
+        [bundle], config.sampling, config.augmentation, config.seed, config.schedule.steps
+    )
+    return Trainer(config, dataset, folder, fingerprint, 3, "cpu", 0, weights)
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a log without the measured speed."""
+    with open(path, newline="") as file:
+        return [{k: v for k, v in row.items() if k != "samples_per_s"} for row in csv.DictReader(file)]
+
+
+def assert_same_run(folder: Path, other: Path) -> None:
+    for name in (loop.LOG, loop.VALIDATION):
+        assert rows(folder / name) == rows(other / name)
+    states = [torch.load(run / CHECKPOINT, weights_only=True) for run in (folder, other)]
+    assert states[0]["step"] == states[1]["step"] == STEPS
+    for part in ("network", "average"):
+        assert list(states[0][part]) == list(states[1][part])
+        for name, tensor in states[0][part].items():
+            assert torch.equal(tensor, states[1][part][name]), name
+    for one, two in zip(*(state["optimizer"]["state"].values() for state in states), strict=True):
+        assert all(torch.equal(one[name], two[name]) for name in one)
+    assert read_metadata(folder / loop.WEIGHTS) == read_metadata(other / loop.WEIGHTS)
+
+
+@pytest.fixture(scope="module")
+def whole_run(bundle: SceneBundle, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run from beginning to end."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "LOG_EVERY", 2)
+        patch.setattr(loop, "SAVE_EVERY", 2)
+        trainer(bundle, folder).run()
+    return folder
+
+
+def test_the_run_directory_holds_logs_and_weights(whole_run):
+    assert [row["step"] for row in rows(whole_run / loop.LOG)] == ["2", "4", "6"]
+    assert [row["step"] for row in rows(whole_run / loop.VALIDATION)] == ["3", "6"]
+    assert all(np.isfinite(float(value)) for row in rows(whole_run / loop.LOG) for value in row.values())
+    network = load_network(whole_run / loop.WEIGHTS)
+    assert network.config == TINY
+    average = torch.load(whole_run / CHECKPOINT, weights_only=True)["average"]
+    assert all(torch.equal(tensor, average[name]) for name, tensor in network.state_dict().items())
+
+
+def test_training_moves_the_weights(bundle, whole_run, tmp_path):
+    start = trainer(bundle, tmp_path).network.state_dict()
+    end = torch.load(whole_run / CHECKPOINT, weights_only=True)["network"]
+    moved = [name for name, tensor in start.items() if not torch.equal(tensor, end[name])]
+    assert len(moved) > 0.9 * len(start)
+
+
+def test_two_runs_are_equal_bit_for_bit(bundle, whole_run, tmp_path):
+    trainer(bundle, tmp_path).run()
+    assert_same_run(whole_run, tmp_path)
+
+
+@pytest.mark.parametrize("pieces", [[1, 2], [4], [3, 1, 1]])
+def test_a_resumed_run_equals_the_uninterrupted_one(bundle, whole_run, tmp_path, pieces):
+    for steps in pieces:
+        trainer(bundle, tmp_path).run(stop_after=steps)
+    torch.manual_seed(999)  # whatever else the process did
+    last = trainer(bundle, tmp_path)
+    assert last.step == sum(pieces)
+    last.run()
+    assert_same_run(whole_run, tmp_path)
+
+
+def test_a_killed_run_goes_on_from_its_checkpoint(bundle, whole_run, tmp_path, monkeypatch):
+    original = Trainer._train_step
+
+    def killed(self: Trainer, batch: dict[str, torch.Tensor]) -> dict[str, float]:
+        if self.step == 3:
+            raise KeyboardInterrupt
+        return original(self, batch)
+
+    monkeypatch.setattr(Trainer, "_train_step", killed)
+    with pytest.raises(KeyboardInterrupt):
+        trainer(bundle, tmp_path).run()
+    monkeypatch.setattr(Trainer, "_train_step", original)
+    with open(tmp_path / loop.LOG, "a") as file:  # logged after the checkpoint, the last row torn
+        file.write("4," + ",".join("9" * (len(rows(tmp_path / loop.LOG)[0]))) + "\n5,0.1")
+    (tmp_path / "checkpoint.partial").write_bytes(b"torn")
+    again = trainer(bundle, tmp_path)
+    assert again.step == 2
+    again.run()
+    assert_same_run(whole_run, tmp_path)
+
+
+def test_a_finished_run_does_nothing_more(bundle, whole_run, tmp_path):
+    trainer(bundle, tmp_path).run()
+    trainer(bundle, tmp_path).run()
+    assert_same_run(whole_run, tmp_path)
+
+
+def poisoned(bundle: SceneBundle, field: str) -> type[SceneBundleDataset]:
+    class Poisoned(SceneBundleDataset):
+        def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
+            batch = super().__getitem__(step)
+            if step == 3:
+                batch[field][0, 0, 0] = float("nan")
+            return batch
+
+    return Poisoned([bundle], CONFIG.sampling, CONFIG.augmentation, CONFIG.seed, STEPS)
+
+
+@pytest.mark.parametrize("field", ["correspondences", "attributes"])
+def test_nan_stops_the_run_and_keeps_the_batch(bundle, whole_run, tmp_path, field):
+    run = Trainer(CONFIG, poisoned(bundle, field), tmp_path, fingerprint, 3, "cpu", 0)
+    with pytest.raises(DivergedError, match="step 3"):
+        run.run()
+    (saved,) = tmp_path.glob("diverged_3*.pt")
+    batch = torch.load(saved, weights_only=True)
+    assert torch.isnan(batch[field][0, 0, 0])
+    state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    assert state["step"] == 2
+    assert all(torch.isfinite(tensor).all() for tensor in state["network"].values())
+    trainer(bundle, tmp_path).run()  # with the data mended, the run goes on as if nothing had been
+    assert_same_run(whole_run, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        dataclasses.replace(CONFIG, seed=6),
+        dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, learning_rate=1e-3)),
+        dataclasses.replace(CONFIG, network=dataclasses.replace(TINY, channels=16)),
+    ],
+)
+def test_checkpoints_of_another_config_are_refused(bundle, tmp_path, changed):
+    trainer(bundle, tmp_path).run(stop_after=1)
+    with pytest.raises(ConfigError, match=r"checkpoint\.pt"):
+        trainer(bundle, tmp_path, changed)
+
+
+def test_a_run_may_start_from_weights(bundle, tmp_path):
+    save_network(tiny_network(seed=8), tmp_path / "start.safetensors")
+    run = trainer(bundle, tmp_path / "run", weights=tmp_path / "start.safetensors")
+    for name, tensor in tiny_network(seed=8).state_dict().items():
+        assert torch.equal(run.network.state_dict()[name], tensor)
+        assert torch.equal(run.average.state_dict()[name], tensor)
+
+
+def test_learning_rate_warms_up_and_falls_to_its_fraction():
+    schedule = ScheduleConfig(steps=110, warmup_steps=10, learning_rate=1e-3, final_fraction=0.1)
+    rates = [learning_rate(schedule, step) for step in range(111)]
+    np.testing.assert_allclose(rates[:10], np.arange(1, 11) * 1e-4)
+    np.testing.assert_allclose([rates[10], rates[60], rates[110]], [1e-3, 0.55e-3, 1e-4])
+    assert (np.diff(rates[10:]) < 0).all()
+
+
+def test_norms_and_biases_have_no_weight_decay(bundle, tmp_path):
+    decayed, free = trainer(bundle, tmp_path).optimizer.param_groups
+    assert decayed["weight_decay"] == CONFIG.schedule.weight_decay
+    assert free["weight_decay"] == 0.0
+    assert all(parameter.dim() > 1 for parameter in decayed["params"])
+    assert all(parameter.dim() <= 1 for parameter in free["params"])
+
+
+def test_the_average_follows_the_weights(bundle, tmp_path):
+    run = trainer(bundle, tmp_path)
+    before = {name: tensor.clone() for name, tensor in run.average.state_dict().items()}
+    run.run(stop_after=1)
+    name = "heads.0.logit.weight"
+    expected = 0.1 * before[name] + 0.9 * run.network.state_dict()[name]  # the first step's decay is 1 / 10
+    torch.testing.assert_close(run.average.state_dict()[name], expected)
+
+
+def test_bf16_runs_on_the_cpu(bundle, tmp_path):
+    config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, precision="bf16"))
+    trainer(bundle, tmp_path, config).run(stop_after=2)
+    (row,) = rows(tmp_path / loop.LOG)
+    assert np.isfinite(float(row["loss"]))
+
+
+def test_quick_validation_gives_percentages(bundle):
+    pairs = select_pairs([bundle], 2)
+    assert [pair.index for pair in pairs] == [0, 2]
+    figures = quick_validation(tiny_network(), pairs)
+    assert set(figures) == {"precision", "recall", "fit_mAP@5", "fit_mAP@20", "essential_mAP@5", "essential_mAP@20"}
+    assert all(0.0 <= value <= 100.0 for value in figures.values())
+
+
+CONFIG_TOML = """
+name = "tiny"
+tuning_scenes = ["yard"]
+[network]
+channels = 8
+clusters = 8
+[sampling]
+batch_size = 2
+matches = [32]
+matches_weights = [1.0]
+pool_batches = 1
+[schedule]
+steps = 2
+warmup_steps = 1
+precision = "fp32"
+"""
+
+
+def test_the_command_trains_and_resumes(tmp_path, capsys):
+    data = tmp_path / "data"
+    data.mkdir()
+    for seed, name in enumerate(("hall", "yard")):
+        write_bundle(data / f"{name}.npz", [make_scene(seed=seed, right=60, wrong=40)])
+    (tmp_path / "run.toml").write_text(CONFIG_TOML)
+    command = ["--config", str(tmp_path / "run.toml"), "--data", str(data), "--run", str(tmp_path / "run")]
+    command += ["--device", "cpu", "--workers", "0", "--validate-pairs", "1"]
+    assert main([*command, "--stop-after", "1"]) == 0
+    assert not (tmp_path / "run" / loop.VALIDATION).exists()
+    assert main(command) == 0
+    assert [row["step"] for row in rows(tmp_path / "run" / loop.VALIDATION)] == ["2"]
+    assert load_network(tmp_path / "run" / loop.WEIGHTS).config == TINY
+
+    (data / "yard.npz").unlink()
+    assert main(command) == 2
+    assert "tuning_scenes: not in the data folder: yard" in capsys.readouterr().err
+    (data / "yard.npz").write_bytes(b"torn")
+    assert main(command) == 2
+    assert "yard.npz" in capsys.readouterr().err
