@@ -1,0 +1,199 @@
+"""The ONNX file keeps its contract and says what the torch network says."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from export_tools import parity
+from networks import tiny_network, two_view_batch
+from torch import nn
+
+from mgca_filter.backends import METADATA_KEYS, Backend, open_backend
+from mgca_filter.calibration import Calibration
+from mgca_filter.network import MGCANet, NetworkConfig, save_network
+from mgca_filter.onnx_export import ModelDescription, export_model, fold_batch_norm, model_metadata
+
+CONFIG = NetworkConfig(channels=16, clusters=8, stages=2)
+DESCRIPTION = ModelDescription(
+    name="tiny",
+    version="1.2",
+    git_commit="abc",
+    training_data="random weights",
+    license="none",
+    calibration=Calibration(0.7, -0.3),
+    decision_threshold=0.25,
+)
+
+
+def settled_network(config: NetworkConfig = CONFIG) -> MGCANet:
+    """A random network whose norms know the statistics of its input."""
+    torch.manual_seed(2)
+    network = MGCANet(config).train()
+    with torch.no_grad():
+        for seed in range(12):
+            network(*two_view_batch(100, batch=4, seed=seed))
+    return network.eval().requires_grad_(False)
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    network: MGCANet
+    onnx_path: Path
+    torch_path: Path
+    onnx: Backend
+    torch: Backend
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Exported:
+    network = settled_network()
+    paths = export_model(network, tmp_path_factory.mktemp("export"), DESCRIPTION)
+    return Exported(network, *paths, open_backend(paths[0], "onnxruntime"), open_backend(paths[1], "torch"))
+
+
+@pytest.fixture(scope="module")
+def model(exported: Exported) -> onnx.ModelProto:
+    return onnx.load(str(exported.onnx_path))
+
+
+def test_the_graph_is_opset_17_without_what_opencv_lacks(model):
+    assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
+    operators = {node.op_type for node in model.graph.node}
+    assert not operators & {"If", "Loop", "Scan", "Einsum", "SequenceConstruct", "SequenceAt"}
+    assert all(node.domain == "" for node in model.graph.node)
+    assert "MatMul" in operators
+
+
+def test_no_tensor_is_float64(model):
+    double = onnx.TensorProto.DOUBLE
+    assert not [tensor.name for tensor in model.graph.initializer if tensor.data_type == double]
+    constants = [a.t for node in model.graph.node for a in node.attribute if a.type == onnx.AttributeProto.TENSOR]
+    assert constants
+    assert not [tensor.name for tensor in constants if tensor.data_type == double]
+    casts = [a.i for node in model.graph.node if node.op_type == "Cast" for a in node.attribute if a.name == "to"]
+    assert double not in casts
+    inferred = onnx.shape_inference.infer_shapes(model).graph.value_info
+    assert not [value.name for value in inferred if value.type.tensor_type.elem_type == double]
+
+
+def test_inputs_and_outputs_declare_their_shapes(model):
+    def shapes(values: list[onnx.ValueInfoProto]) -> dict[str, list[str | int]]:
+        assert all(value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT for value in values)
+        return {v.name: [d.dim_param or d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
+
+    assert shapes(model.graph.input) == {"correspondences": ["B", "N", 4], "attributes": ["B", "N", 8]}
+    assert shapes(model.graph.output) == {"logits": ["B", "N"], "essential": ["B", 3, 3]}
+
+
+def test_metadata_say_what_was_described(exported, model):
+    properties = {entry.key: entry.value for entry in model.metadata_props}
+    assert set(properties) == set(METADATA_KEYS)
+    assert NetworkConfig.from_json(properties["config"]) == CONFIG
+    for backend in (exported.onnx, exported.torch):
+        metadata = backend.metadata
+        for field in ("name", "version", "git_commit", "training_data", "license", "detector", "calibration"):
+            assert getattr(metadata, field) == getattr(DESCRIPTION, field)
+        assert metadata.decision_threshold == 0.25
+        assert (metadata.candidate_max_ratio, metadata.candidate_min_count) == (0.95, 32)
+        assert json.loads(properties["config"]) == metadata.config
+
+
+def test_the_prior_in_the_metadata_is_the_networks(exported):
+    _, attributes = two_view_batch(50)
+    expected = exported.network.prior(attributes)[0].numpy()
+    np.testing.assert_allclose(exported.onnx.metadata.prior.logits(attributes[0].numpy()), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 127])
+def test_onnx_runtime_says_what_torch_says(exported, count):
+    row = parity.compare(exported.onnx, exported.torch, count)
+    assert row.logit_difference < 1e-3
+    assert row.masks_equal
+    assert row.passed
+
+
+def rounding_sensitivity(network: MGCANet, count: int) -> float:
+    """Largest change of torch's own logits when the input moves by one unit in the last place."""
+    correspondences, attributes = parity.two_view_input(count)
+    reference = network(torch.from_numpy(correspondences), torch.from_numpy(attributes)).logits
+    rng = np.random.default_rng(0)
+    changes = []
+    for _ in range(3):
+        toward = np.where(rng.random(correspondences.shape) < 0.5, np.inf, -np.inf).astype(np.float32)
+        moved = torch.from_numpy(np.nextafter(correspondences, toward))
+        changes.append(float((network(moved, torch.from_numpy(attributes)).logits - reference).abs().max()))
+    return max(changes)
+
+
+def test_many_matches_differ_no_more_than_rounding_makes_torch_differ(exported):
+    # Neighbours and the better half are chosen by comparison, so rounding swaps some of 2000 matches, and random
+    # weights carry a swap on. What can be asked of them is that the export adds nothing to it.
+    inputs = parity.two_view_input(2000)
+    difference = np.abs(exported.onnx.infer(*inputs)[0] - exported.torch.infer(*inputs)[0])
+    sensitivity = rounding_sensitivity(exported.network, 2000)
+    assert difference.max() < 1e-3 + 5 * sensitivity
+    assert np.median(difference) < 1e-2
+
+
+def test_batches_are_dynamic(exported):
+    correspondences, attributes = (tensor.numpy() for tensor in two_view_batch(33, batch=3))
+    logits, essential = exported.onnx.infer(correspondences, attributes)
+    assert essential.shape == (3, 3, 3)
+    for pair in range(3):
+        alone, _ = exported.onnx.infer(correspondences[pair : pair + 1], attributes[pair : pair + 1])
+        np.testing.assert_allclose(alone[0], logits[pair], atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "counts"),
+    [
+        ({"stages": 1, "graph_expansion": 2}, (1, 8, 127, 2000)),  # no feedback that would carry a swap on
+        ({"stages": 1, "attention": "point"}, (1, 8, 127)),
+    ],
+)
+def test_variants_export_as_well(tmp_path, changes, counts):
+    network = settled_network(dataclasses.replace(CONFIG, **changes))
+    rows = parity.check_parity(*export_model(network, tmp_path, DESCRIPTION), counts)
+    assert [row.count for row in rows] == list(counts)
+    assert all(row.logit_difference < 1e-3 for row in rows), parity.format_parity(rows)
+
+
+def test_three_stages_export_as_well(tmp_path):
+    network = settled_network(dataclasses.replace(CONFIG, stages=3, channels=8))
+    for row in parity.check_parity(*export_model(network, tmp_path, DESCRIPTION), (1, 7, 60)):
+        assert row.logit_difference < 1e-3 + 5 * rounding_sensitivity(network, row.count)
+
+
+def test_folding_leaves_the_network_and_its_answer_alone():
+    network = tiny_network()
+    before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
+    folded = fold_batch_norm(network)
+    assert all(torch.equal(tensor, network.state_dict()[name]) for name, tensor in before.items())
+    batch = two_view_batch(40)
+    torch.testing.assert_close(folded(*batch).logits, network(*batch).logits, atol=1e-3, rtol=1e-3)
+    count = [sum(isinstance(m, nn.BatchNorm1d) for m in net.modules()) for net in (network, folded)]
+    assert count[1] < count[0]
+
+
+def test_a_network_without_prior_does_not_fit_the_contract():
+    with pytest.raises(ValueError, match="no prior"):
+        model_metadata(MGCANet(dataclasses.replace(CONFIG, attributes=False)), DESCRIPTION)
+
+
+def test_parity_tells_a_difference(exported, tmp_path):
+    other = settled_network()
+    other.heads[0].logit.bias += 1.0
+    other.final_head.logit.bias += 0.01
+    changed = tmp_path / "changed.safetensors"
+    save_network(other, changed, model_metadata(other, DESCRIPTION))
+    (row,) = parity.check_parity(exported.onnx_path, changed, counts=(40,))
+    assert not row.passed
+    assert row.logit_difference > 1e-3
+    assert "FAILED" in parity.format_parity([row])
+    assert "| 40 |" in parity.format_parity([row])
