@@ -152,7 +152,7 @@ class Trainer:
         if (self.step + 1) % LOG_EVERY:
             return {}
         precision, recall = precision_recall(output.logits, batch["labels"])
-        figures = {"loss": loss, **parts, "precision": precision, "recall": recall, "gradient_norm": norm}
+        figures = {"loss": loss.detach(), **parts, "precision": precision, "recall": recall, "gradient_norm": norm}
         return {name: float(value) for name, value in figures.items()} | {"learning_rate": rate}
 
     @torch.no_grad()

@@ -99,5 +99,6 @@ def test_missing_and_binary_files_are_named(tmp_path):
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_configs_are_valid(path):
     config = load_config(path)
-    assert config.tuning_scenes
+    assert config.scenes or config.tuning_scenes
+    assert not set(config.scenes) & set(config.tuning_scenes)
     assert config.schedule.steps > config.schedule.warmup_steps

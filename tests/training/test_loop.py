@@ -111,7 +111,7 @@ def test_two_runs_are_equal_bit_for_bit(bundle, whole_run, tmp_path):
     assert_same_run(whole_run, tmp_path)
 
 
-@pytest.mark.parametrize("pieces", [[1, 2], [4], [3, 1, 1]])
+@pytest.mark.parametrize("pieces", [[4], [1, 2]])
 def test_a_resumed_run_equals_the_uninterrupted_one(bundle, whole_run, tmp_path, pieces):
     for steps in pieces:
         trainer(bundle, tmp_path).run(stop_after=steps)
@@ -190,11 +190,12 @@ def test_checkpoints_of_another_config_are_refused(bundle, tmp_path, changed):
 
 
 def test_a_run_may_start_from_weights(bundle, tmp_path):
-    save_network(tiny_network(seed=8), tmp_path / "start.safetensors")
+    start = tiny_network(seed=8)
+    save_network(start, tmp_path / "start.safetensors")
     run = trainer(bundle, tmp_path / "run", weights=tmp_path / "start.safetensors")
-    for name, tensor in tiny_network(seed=8).state_dict().items():
-        assert torch.equal(run.network.state_dict()[name], tensor)
-        assert torch.equal(run.average.state_dict()[name], tensor)
+    for network in (run.network, run.average):
+        for mine, given in zip(network.state_dict().values(), start.state_dict().values(), strict=True):
+            assert torch.equal(mine, given)
 
 
 def test_learning_rate_warms_up_and_falls_to_its_fraction():
