@@ -22,8 +22,10 @@ from .calibration import Calibration
 from .correspondences import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from .network import MGCANet, save_network
 from .network.config import ATTRIBUTE_CHANNELS
+from .network.graph import AnnularConvolution
 from .network.mgca_net import Prior
-from .network.point_cn import LinearNorm
+from .network.point_cn import ChannelBatchNorm, LinearNorm, PointCN
+from .onnx_simplify import simplify
 
 OPSET = 17
 MINIMUM_ONNXRUNTIME = "1.15"
@@ -60,24 +62,51 @@ class _Contract(nn.Module):
         return output.logits, output.essential
 
 
+@torch.no_grad()
 def fold_batch_norm(network: MGCANet) -> MGCANet:
-    """Copy of a network in evaluation mode whose convolutions have taken in the BatchNorm that follows them."""
+    """Copy of a network in evaluation mode whose convolutions have taken in the BatchNorm that follows them.
+
+    Biases in front of a context norm go as well: it subtracts them.
+    """
     folded = deepcopy(network).eval()
     for parent in list(folded.modules()):
         for name, child in parent.named_children():
             if isinstance(child, LinearNorm):
                 setattr(parent, name, _folded(child))
+        if isinstance(parent, AnnularConvolution):
+            scale, shift = _scale_and_shift(parent.ring_norm)
+            parent.centre.mul_(scale)
+            parent.neighbour.mul_(scale)
+            setattr(parent, "ring_norm", _Shift(shift))  # noqa: B010 (not of the declared type)
+        if isinstance(parent, PointCN):
+            parent.linear1.register_parameter("bias", None)
     return folded
 
 
-@torch.no_grad()
+class _Shift(nn.Module):
+    """What is left of a BatchNorm when its scale has gone into the weights before it."""
+
+    shift: Tensor
+
+    def __init__(self, shift: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("shift", shift)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.shift
+
+
 def _folded(layer: LinearNorm) -> nn.Linear:
-    norm = layer.norm
-    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    scale, shift = _scale_and_shift(layer.norm)
     linear = nn.Linear(layer.linear.in_features, layer.linear.out_features)
     linear.weight.copy_(layer.linear.weight * scale[:, None])
-    linear.bias.copy_(norm.bias - norm.running_mean * scale)
+    linear.bias.copy_(shift)
     return linear
+
+
+def _scale_and_shift(norm: ChannelBatchNorm) -> tuple[Tensor, Tensor]:
+    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
+    return scale, norm.bias - norm.running_mean * scale
 
 
 def model_metadata(network: MGCANet, description: ModelDescription) -> dict[str, str]:
@@ -140,6 +169,7 @@ def export_onnx(network: MGCANet, path: str | Path, metadata: Mapping[str, str])
     model = onnx.load(str(path))
     for axis in (1, 2):  # tracing loses the two fixed axes of the essential matrix
         model.graph.output[1].type.tensor_type.shape.dim[axis].dim_value = 3
+    model = simplify(model)
     onnx.helper.set_model_props(model, dict(metadata))
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(path))

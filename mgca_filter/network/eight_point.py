@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 SQUARINGS = 20
+SQUARINGS_PER_NORMALISATION = 4  # (1 / 9)^16 is far above the smallest float32
 MINIMUM_POINTS = 16  # below this the essential matrix of the network is arbitrary
 LABEL_DISTANCE = 1e-4
 
@@ -22,27 +23,28 @@ def smallest_eigenvector(A: Tensor) -> Tensor:
         return M / (M * eye).sum((-2, -1), keepdim=True).clamp_min(1e-30)
 
     M = unit_trace(unit_trace(A) * -1.0 + eye)
-    for _ in range(SQUARINGS):
-        M = unit_trace(M @ M)
+    for step in range(1, SQUARINGS + 1):
+        M = M @ M
+        if step % SQUARINGS_PER_NORMALISATION == 0:
+            M = unit_trace(M)
     column = (M * eye).sum(-1).argmax(-1).view(-1, 1, 1)
     v = M.gather(2, column.expand(-1, M.shape[1], 1))[..., 0]
     return v / (v * v).sum(-1, keepdim=True).clamp_min(1e-30).sqrt()
 
 
-def _conditioning(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """Points (B, N, 2) centred and scaled to a weighted mean square of 2, and the transform (B, 3, 3)."""
-    centre = (points * weights).sum(1, keepdim=True)  # (B, 1, 2)
+def _conditioning(points: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Points (B, N, 2) centred and scaled to a weighted mean square of 2; centre (B, 1, 2), scale (B, 1, 1)."""
+    centre = (points * weights).sum(1, keepdim=True)
     centred = points - centre
-    spread = (centred.square() * weights).sum((1, 2)).view(-1, 1, 1)
-    scale = torch.rsqrt(0.5 * spread + 1e-8)  # (B, 1, 1)
-    zero, one = torch.zeros_like(scale), torch.ones_like(scale)
-    cx, cy = centre[..., 0:1], centre[..., 1:2]
-    rows = [
-        torch.cat([scale, zero, -cx * scale], 2),
-        torch.cat([zero, scale, -cy * scale], 2),
-        torch.cat([zero, zero, one], 2),
-    ]
-    return centred * scale, torch.cat(rows, 1)
+    spread = (centred.square() * weights).sum((1, 2), keepdim=True)
+    scale = torch.rsqrt(0.5 * spread + 1e-8)
+    return centred * scale, centre, scale
+
+
+def _undo_conditioning(M: Tensor, centre: Tensor, scale: Tensor) -> Tensor:
+    """M T (B, 3, 3) with T = [[s, 0, -s cx], [0, s, -s cy], [0, 0, 1]], the transform of the conditioning."""
+    scaled = M[..., :2] * scale
+    return torch.cat([scaled, M[..., 2:] - (scaled * centre).sum(-1, keepdim=True)], -1)
 
 
 def weighted_eight_point(correspondences: Tensor, weights: Tensor) -> Tensor:
@@ -55,13 +57,14 @@ def weighted_eight_point(correspondences: Tensor, weights: Tensor) -> Tensor:
     Hartley's conditioning with the weights, then the smallest eigenvector of Σ w φ φᵀ.
     """
     w = weights.unsqueeze(-1)  # (B, N, 1)
-    p1, T1 = _conditioning(correspondences[..., :2], w)
-    p2, T2 = _conditioning(correspondences[..., 2:], w)
+    p1, centre1, scale1 = _conditioning(correspondences[..., :2], w)
+    p2, centre2, scale2 = _conditioning(correspondences[..., 2:], w)
     q1 = torch.cat([p1, torch.ones_like(w)], -1)
     # φ holds x2 ⊗ x1, row by row of E.
     phi = torch.cat([p2[..., 0:1] * q1, p2[..., 1:2] * q1, q1], -1)  # (B, N, 9)
     v = smallest_eigenvector((phi * w).transpose(1, 2) @ phi)
-    E = T2.transpose(1, 2) @ v.view(-1, 3, 3) @ T1
+    E = _undo_conditioning(v.view(-1, 3, 3), centre1, scale1)
+    E = _undo_conditioning(E.transpose(1, 2), centre2, scale2).transpose(1, 2)
     return E / E.square().sum((-2, -1), keepdim=True).clamp_min(1e-30).sqrt()
 
 

@@ -78,15 +78,15 @@ class Head(nn.Module):
 
 
 def match_count(logits: Tensor) -> Tensor:
-    """Number of matches as an integer tensor (B, 1), so that an exported graph computes it, too."""
-    return torch.ones_like(logits).sum(-1, keepdim=True).long()
+    """Number of matches as a float tensor (B, 1), so that an exported graph computes it, too."""
+    return torch.ones_like(logits).sum(-1, keepdim=True)
 
 
 def better_half(logits: Tensor) -> Tensor:
     """Bool (B, N): the ceil(N/2) highest logits, never fewer than min(N, 16); ties at the border all count."""
     count = match_count(logits)
-    last = torch.maximum((count + 1) // 2, count.clamp_max(MINIMUM_POINTS)) - 1
-    threshold = logits.detach().sort(-1, descending=True).values.gather(1, last)
+    kept = torch.maximum((0.5 * count).ceil(), count.clamp_max(MINIMUM_POINTS))
+    threshold = logits.detach().sort(-1, descending=True).values.gather(1, kept.long() - 1)
     return logits >= threshold
 
 
