@@ -58,7 +58,7 @@ class MatchFilter:
             ``"none"``, which returns scores and a mask of scores above 0.5, no geometry.
         model: path of a model file; None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
-        backend: ``"auto"``, ``"onnxruntime"`` or ``"torch"``.
+        backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
         seed: of every random choice.
 
     Raises:
@@ -245,7 +245,7 @@ def filter_matches(
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
-        backend: ``"auto"``, ``"onnxruntime"`` or ``"torch"``.
+        backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
         seed: of every random choice; same seed, input and machine give the same bits.
 
     Returns:

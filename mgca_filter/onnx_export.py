@@ -16,8 +16,8 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from .backends.base import INPUT_NAMES, OUTPUT_NAMES
 from .backends.metadata import CONTRACT_VERSION, METADATA_KEYS
-from .backends.onnx_backend import INPUT_NAMES, OUTPUT_NAMES
 from .calibration import Calibration
 from .correspondences import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from .network import MGCANet, save_network

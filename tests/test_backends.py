@@ -87,15 +87,48 @@ class BackendContract:
             backend.infer(correspondences[:, order], attributes[:, order])[0], logits[:, order], atol=1e-5
         )
 
+    @pytest.mark.parametrize(
+        ("correspondences", "attributes", "named"),
+        [
+            (np.zeros((1, 5, 3), np.float32), np.zeros((1, 5, 8), np.float32), "correspondences"),
+            (np.zeros((1, 5, 4), np.float32), np.zeros((5, 8), np.float32), "attributes"),
+            (np.zeros((1, 5, 4)), np.zeros((1, 5, 8), np.float32), "float64"),
+            (np.zeros((1, 5, 4), np.float32), np.zeros((1, 6, 8), np.float32), "differ"),
+            (np.zeros((1, 0, 4), np.float32), np.zeros((1, 0, 8), np.float32), "at least one match"),
+            (np.full((1, 5, 4), np.nan, np.float32), np.zeros((1, 5, 8), np.float32), "correspondences.*NaN"),
+            (np.zeros((1, 5, 4), np.float32), np.full((1, 5, 8), np.inf, np.float32), "attributes.*infinite"),
+        ],
+    )
+    def test_input_that_cannot_be_is_named(
+        self, backend: Backend, correspondences: np.ndarray, attributes: np.ndarray, named: str
+    ) -> None:
+        with pytest.raises(BackendError, match=named):
+            backend.infer(correspondences, attributes)
+
 
 class TestOnnxBackend(BackendContract):
     @pytest.fixture
     def backend(self, model_file: Path) -> Backend:
         return OnnxBackend(model_file)
 
-    def test_refused_input_is_a_backend_error(self, backend: Backend) -> None:
-        with pytest.raises(BackendError):
-            backend.infer(np.zeros((1, 5, 3), dtype=np.float32), np.zeros((1, 5, 8), dtype=np.float32))
+    def test_the_number_of_threads_comes_from_the_environment(
+        self, model_file: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MGCA_FILTER_NUM_THREADS", "3")
+        assert OnnxBackend(model_file)._session.get_session_options().intra_op_num_threads == 3
+        monkeypatch.setenv("MGCA_FILTER_NUM_THREADS", "many")
+        with pytest.raises(BackendError, match="MGCA_FILTER_NUM_THREADS.*many"):
+            OnnxBackend(model_file)
+
+    def test_refusal_by_the_runtime_is_a_backend_error(self, backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+        import onnxruntime
+
+        def refuse(*_: object) -> None:
+            raise RuntimeError("no memory")
+
+        monkeypatch.setattr(onnxruntime.InferenceSession, "run", refuse)
+        with pytest.raises(BackendError, match="no memory"):
+            backend.infer(*random_input(5))
 
 
 @pytest.mark.usefixtures("torch_stand_in")

@@ -1,4 +1,4 @@
-"""Inference backends behind one protocol; ONNX Runtime by default, PyTorch where that is not to be had."""
+"""Inference backends behind one protocol; ONNX Runtime by default, PyTorch where that is not to be had, or OpenCV."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from ..errors import BackendError, MgcaFilterError
 from .base import Backend
 from .metadata import CONTRACT_VERSION, METADATA_KEYS, ModelMetadata
 from .onnx_backend import OnnxBackend, Providers
+from .opencv_backend import OpenCvBackend
 from .torch_backend import TorchBackend
 
-BACKENDS = ("auto", "onnxruntime", "torch")
+BACKENDS = ("auto", "onnxruntime", "opencv", "torch")
 _PROBE_MATCHES = 16
 
 _open_backends: dict[tuple[Any, ...], Backend] = {}
@@ -28,6 +29,7 @@ __all__ = [
     "Backend",
     "ModelMetadata",
     "OnnxBackend",
+    "OpenCvBackend",
     "Providers",
     "TorchBackend",
     "open_backend",
@@ -41,8 +43,9 @@ def open_backend(path: Path, backend: str = "auto", providers: Providers | None 
     Args:
         path: ``.onnx`` or ``.safetensors``; the PyTorch backend takes the ``.safetensors`` file beside an
             ``.onnx`` file.
-        backend: ``"onnxruntime"``, ``"torch"``, or ``"auto"``: ONNX Runtime, and PyTorch with one warning where
-            that cannot be started (or without one, for a ``.safetensors`` file).
+        backend: ``"onnxruntime"``, ``"opencv"`` (the DNN module of OpenCV 5), ``"torch"``, or ``"auto"``: ONNX
+            Runtime, and PyTorch with one warning where that cannot be started (or without one, for a
+            ``.safetensors`` file).
         providers: execution providers of ONNX Runtime.
 
     Raises:
@@ -52,6 +55,8 @@ def open_backend(path: Path, backend: str = "auto", providers: Providers | None 
     weights = path.with_suffix(".safetensors")
     if backend == "torch" or (backend == "auto" and path == weights):
         return TorchBackend(weights)
+    if backend == "opencv":
+        return OpenCvBackend(path)
     try:
         opened = OnnxBackend(path, providers)
         if backend == "auto":

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..correspondences import ATTRIBUTE_COUNT
+from ..errors import BackendError, ModelError
 from .metadata import ModelMetadata
 
 Float32Array = NDArray[np.float32]
+
+INPUT_NAMES = ["correspondences", "attributes"]
+OUTPUT_NAMES = ["logits", "essential"]
 
 
 class Backend(Protocol):
@@ -17,7 +24,7 @@ class Backend(Protocol):
 
     @property
     def name(self) -> str:
-        """``"onnxruntime"`` or ``"torch"``."""
+        """``"onnxruntime"``, ``"opencv"`` or ``"torch"``."""
 
     @property
     def metadata(self) -> ModelMetadata:
@@ -34,5 +41,27 @@ class Backend(Protocol):
             Logits (B, N) and essential matrices (B, 3, 3) of unit Frobenius norm and free sign.
 
         Raises:
-            BackendError: the runtime refused (out of memory, say).
+            BackendError: the input is empty, not finite or of another shape, or the runtime refused (out of memory,
+                say).
         """
+
+
+def check_input(correspondences: Float32Array, attributes: Float32Array) -> None:
+    """Raise BackendError unless the arrays are what :meth:`Backend.infer` takes."""
+    for name, array, width in (("correspondences", correspondences, 4), ("attributes", attributes, ATTRIBUTE_COUNT)):
+        if array.ndim != 3 or array.shape[2] != width or array.dtype != np.float32:
+            raise BackendError(f"{name}: expected float32 (B, N, {width}), got {array.dtype} {array.shape}")
+        if not np.isfinite(array).all():
+            raise BackendError(f"{name}: expected finite values, got NaN or infinite ones")
+    if correspondences.shape[:2] != attributes.shape[:2]:
+        raise BackendError(f"correspondences {correspondences.shape} and attributes {attributes.shape} differ in size")
+    if 0 in correspondences.shape:
+        raise BackendError(f"expected at least one match, got correspondences of shape {correspondences.shape}")
+
+
+def check_names(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> None:
+    """Raise ModelError unless a model file has the contract's inputs and outputs."""
+    if sorted(inputs) != sorted(INPUT_NAMES):
+        raise ModelError(f"{path}: inputs {list(inputs)}, expected {INPUT_NAMES}")
+    if not set(OUTPUT_NAMES) <= set(outputs):
+        raise ModelError(f"{path}: outputs {list(outputs)}, expected {OUTPUT_NAMES}")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import BackendError, ModelError
-from .base import Float32Array
+from .base import Float32Array, check_input
 from .metadata import ModelMetadata, check_model_file, parse_metadata
 
 _HEADER_LENGTH_BYTES = 8
@@ -49,6 +49,7 @@ class TorchBackend:
 
     def infer(self, correspondences: Float32Array, attributes: Float32Array) -> tuple[Float32Array, Float32Array]:
         """One forward pass; see :class:`~mgca_filter.backends.base.Backend`."""
+        check_input(correspondences, attributes)
         torch = self._torch
         try:
             with torch.inference_mode():

@@ -1,0 +1,217 @@
+"""How fast is the filter here? ``python export/benchmark.py [--threads 2] [--bundle FILE --pair 0]`` prints ratios.
+
+All calls run in turn in one process, on as many threads, on the raw SIFT matches of the example pair (or of a pair of
+a scene bundle); medians. Cold start and memory are measured in processes of their own. Where the milliseconds of the
+network go is told by ``python export/floor.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from mgca_filter import BackendError, MatchFilter, match_images, model_path
+from mgca_filter.backends import open_backend
+from mgca_filter.backends.onnx_backend import THREADS_VARIABLE
+from mgca_filter.correspondences import normalize_points
+from mgca_filter.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from mgca_filter.scene_bundle import SceneBundle
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "images"
+INLIER_DISTANCE = 1e-4  # squared symmetric epipolar distance on the normalised planes: the field's ground truth
+MAGSAC_ITERATIONS = (1000, 5000, 100_000)  # OpenCV's default; the evaluation's rivals; enough for one right in ten
+MEMORY_COUNTS = (500, 2000, 8000)
+
+COLD_START = """
+import sys, time
+started = time.perf_counter()
+import mgca_filter
+imported = time.perf_counter()
+import numpy as np
+points = np.random.default_rng(0).random((2, 500, 2)) * 500
+mgca_filter.filter_matches(*points, None, backend=sys.argv[1])
+first = time.perf_counter()
+mgca_filter.filter_matches(*points, None, backend=sys.argv[1])
+print(imported - started, first - imported, time.perf_counter() - first)
+"""
+MEMORY = """
+import resource, sys
+import numpy as np
+import mgca_filter
+from mgca_filter.backends import open_backend
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+backend, count = open_backend(mgca_filter.model_path(), sys.argv[1]), int(sys.argv[2])
+rng = np.random.default_rng(0)
+backend.infer(rng.random((1, count, 4), dtype=np.float32), rng.random((1, count, 8), dtype=np.float32))
+print((resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024)
+"""
+
+
+@dataclass(frozen=True)
+class RawPair:
+    """Raw matches as a user holds them, their pixels (M, 2) under K (3, 3), and the share of right ones."""
+
+    arguments: tuple[Any, Any, Any]
+    attributes: Any
+    points1: np.ndarray
+    points2: np.ndarray
+    K1: np.ndarray
+    K2: np.ndarray
+    inlier_share: float
+
+
+def example_pair() -> RawPair:
+    """SIFT nearest neighbours of the example pair: cv2.KeyPoint and knnMatch rows."""
+    truth = json.loads((EXAMPLES / "pair.json").read_text())
+    K1, K2 = np.array(truth["K1"]), np.array(truth["K2"])
+    images = [cv2.imread(str(EXAMPLES / truth[name])) for name in ("image1", "image2")]
+    matched = match_images(*images, K1=K1, K2=K2)
+    points1 = np.array([matched.keypoints1[row[0].queryIdx].pt for row in matched.matches])
+    points2 = np.array([matched.keypoints2[row[0].trainIdx].pt for row in matched.matches])
+    share = inlier_share(points1, points2, K1, K2, np.array(truth["R"]), np.array(truth["t"]))
+    arguments = (matched.keypoints1, matched.keypoints2, matched.matches)
+    return RawPair(arguments, None, points1, points2, K1, K2, share)
+
+
+def bundle_pair(path: Path, index: int) -> RawPair:
+    """Raw matches of a pair of a scene bundle: arrays."""
+    pair = SceneBundle(path)[index]
+    share = inlier_share(pair.points1, pair.points2, pair.K1, pair.K2, pair.R, pair.t)
+    arguments = (pair.points1, pair.points2, None)
+    return RawPair(arguments, pair.attributes, pair.points1, pair.points2, pair.K1, pair.K2, share)
+
+
+def inlier_share(
+    points1: np.ndarray, points2: np.ndarray, K1: np.ndarray, K2: np.ndarray, R: np.ndarray, t: np.ndarray
+) -> float:
+    """Share of matches near their epipolar lines."""
+    correspondences = np.hstack([normalize_points(points1, K1), normalize_points(points2, K2)])
+    distance = symmetric_epipolar_distance_squared(correspondences, essential_from_pose(R, t))
+    return float(np.mean(distance < INLIER_DISTANCE))
+
+
+def magsac(pair: RawPair, iterations: int) -> Any:
+    """The call that the filter replaces, at one pixel."""
+    x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
+    threshold = 1.0 / float(np.mean([pair.K1[0, 0], pair.K1[1, 1], pair.K2[0, 0], pair.K2[1, 1]]))
+    return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, iterations)
+
+
+def full_calls(pair: RawPair) -> dict[str, Callable[[], Any]]:
+    """What is compared, by name: whole calls on the raw matches."""
+    filters = MatchFilter(backend="onnxruntime")
+    known = {"K1": pair.K1, "K2": pair.K2, "attributes": pair.attributes}
+    bare = (pair.points1, pair.points2, None)
+    calls: dict[str, Callable[[], Any]] = {
+        "filter_matches, ratio known": lambda: filters.filter(*pair.arguments, **known),
+        "filter_matches, bare points": lambda: filters.filter(*bare, K1=pair.K1, K2=pair.K2),
+    }
+    for iterations in MAGSAC_ITERATIONS:
+        calls[f"findEssentialMat(USAC_MAGSAC), {iterations} iterations"] = lambda n=iterations: magsac(pair, n)
+    calls["`paper` preset, torch eager, all raw matches"] = paper_pass(len(pair.points1))
+    return calls
+
+
+def paper_pass(count: int) -> Callable[[], Any]:
+    """One forward pass of the reference design with random weights."""
+    import torch
+
+    from mgca_filter.network import PRESETS, MGCANet
+
+    network = MGCANet(PRESETS["paper"]).eval()
+    inputs = torch.rand(1, count, 4) - 0.5, torch.rand(1, count, 8)
+
+    def run() -> Any:
+        with torch.inference_mode():
+            return network(*inputs)
+
+    return run
+
+
+def network_calls(count: int) -> dict[str, Callable[[], Any]]:
+    """One forward pass of the shipped model in each runtime."""
+    rng = np.random.default_rng(0)
+    inputs = rng.random((1, count, 4), dtype=np.float32) - 0.5, rng.random((1, count, 8), dtype=np.float32)
+    calls = {}
+    for name in ("onnxruntime", "opencv", "torch"):
+        try:
+            backend = open_backend(model_path(), name)
+        except BackendError as error:
+            print(f"without {name}: {error}", file=sys.stderr)
+            continue
+        calls[name] = lambda backend=backend: backend.infer(*inputs)
+    return calls
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median duration of each call; they take turns, so that a busy moment hits all."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 1):
+        for name, call in calls.items():
+            started = time.perf_counter()
+            call()
+            if turn:  # the first one warms up
+                times[name].append(1e3 * (time.perf_counter() - started))
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def print_ratios(title: str, times: dict[str, float]) -> None:
+    """Milliseconds, and each as a multiple of the first."""
+    first = next(iter(times.values()))
+    print(f"\n{title}\n\n| | ms | ratio |\n|---|---:|---:|")
+    for name, value in times.items():
+        print(f"| {name} | {value:.1f} | {value / first:.2f} |")
+
+
+def run_alone(program: str, *arguments: object) -> list[float]:
+    """Numbers that a program prints in a fresh process."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return [float(word) for word in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
+
+
+def print_cold_start_and_memory(names: list[str]) -> None:
+    """Seconds from import to the first answer, and how far the process grows at its peak."""
+    counts = " | ".join(f"N = {count}" for count in MEMORY_COUNTS)
+    print("\nCold start (seconds; best of three) and growth of the process at its peak (MiB)\n")
+    print(f"| backend | import | first call | next call | {counts} |\n|---|" + "---:|" * (3 + len(MEMORY_COUNTS)))
+    for name in names:
+        start = min((run_alone(COLD_START, name) for _ in range(3)), key=lambda times: times[0] + times[1])
+        memory = [run_alone(MEMORY, name, count)[0] for count in MEMORY_COUNTS]
+        cells = [f"{value:.2f}" for value in start] + [f"{value:.0f}" for value in memory]
+        print(f"| {name} | " + " | ".join(cells) + " |")
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--bundle", type=Path, help="a scene bundle instead of the example pair")
+    parser.add_argument("--pair", type=int, default=0, help="index in the bundle")
+    options = parser.parse_args()
+    os.environ[THREADS_VARIABLE] = os.environ["OMP_NUM_THREADS"] = str(options.threads)
+    cv2.setNumThreads(options.threads)
+    import torch
+
+    torch.set_num_threads(options.threads)
+    pair = bundle_pair(options.bundle, options.pair) if options.bundle else example_pair()
+    print(f"{len(pair.points1)} raw matches, {100 * pair.inlier_share:.0f} % right; {options.threads} threads")
+    print_ratios("Whole calls", median_ms(full_calls(pair), options.repeats))
+    for count in (500, 2000):
+        print_ratios(f"One pass of the network, N = {count}", median_ms(network_calls(count), options.repeats))
+    print_cold_start_and_memory(["onnxruntime", "opencv", "torch"])
+
+
+if __name__ == "__main__":
+    main()
