@@ -1,4 +1,7 @@
-"""Write the model files from trained weights and check them: ``python export/export_model.py WEIGHTS``."""
+"""Write the model files from trained weights and check them: ``python export/export_model.py WEIGHTS``.
+
+``--half-weights`` writes a twin ``NAME_half.onnx`` as well, half the size, and prints how far its answers are.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from parity import check_parity, format_parity
 import mgca_filter
 from mgca_filter.calibration import Calibration
 from mgca_filter.network import load_network
-from mgca_filter.onnx_export import ModelDescription, export_model
+from mgca_filter.onnx_export import ModelDescription, export_model, halve_weights
 
 ROOT = Path(__file__).resolve().parent.parent
 WEIGHTS_LICENSE = (
@@ -29,6 +32,7 @@ def main() -> int:
     parser.add_argument("--folder", type=Path, default=ROOT / "mgca_filter" / "models")
     parser.add_argument("--calibration", type=float, nargs=2, default=(1.0, 0.0), metavar=("SCALE", "OFFSET"))
     parser.add_argument("--training-data", default="67 scenes of real photographs (see the model card)")
+    parser.add_argument("--half-weights", action="store_true", help="write a twin with weights in half precision")
     options = parser.parse_args()
     commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=True)
     description = ModelDescription(
@@ -43,6 +47,11 @@ def main() -> int:
     rows = check_parity(onnx_path, torch_path)
     print(format_parity(rows))
     print(f"{onnx_path} ({onnx_path.stat().st_size / 2**20:.2f} MiB)")
+    if options.half_weights:
+        half_path = onnx_path.with_name(f"{options.name}_half.onnx")
+        halve_weights(onnx_path, half_path)
+        print(format_parity(check_parity(half_path, torch_path)))
+        print(f"{half_path} ({half_path.stat().st_size / 2**20:.2f} MiB)")
     return 0 if all(row.passed for row in rows) else 1
 
 

@@ -1,0 +1,165 @@
+"""The simplified graph is the traced one: same answers, no computations of sizes; and the twin in half precision."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+import mgca_filter
+from mgca_filter.onnx_export import halve_weights
+from mgca_filter.onnx_simplify import simplify
+
+WIDTH = 4
+
+
+def build(nodes: list[onnx.NodeProto], constants: dict[str, np.ndarray] | None = None) -> onnx.ModelProto:
+    """A model from x (B, N, 4) to y, of whatever shape."""
+    graph = helper.make_graph(
+        nodes,
+        "test",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["B", "N", WIDTH])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, None)],
+        [numpy_helper.from_array(value, name) for name, value in (constants or {}).items()],
+    )
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def run(model: onnx.ModelProto, x: np.ndarray) -> np.ndarray:
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    return session.run(["y"], {"x": x})[0]
+
+
+def check(model: onnx.ModelProto) -> tuple[onnx.ModelProto, Counter]:
+    """The simplified model, equal in value at sizes other than those of its trial runs, and its operators."""
+    simplified = simplify(model)
+    rng = np.random.default_rng(1)
+    for batch, count in ((1, 1), (1, 6), (4, 33), (1, 400)):
+        x = rng.normal(size=(batch, count, WIDTH)).astype(np.float32)
+        np.testing.assert_allclose(run(simplified, x), run(model, x), atol=1e-5)
+    return simplified, Counter(node.op_type for node in simplified.graph.node)
+
+
+def node(operator: str, inputs: list[str], output: str, **attributes: object) -> onnx.NodeProto:
+    return helper.make_node(operator, inputs, [output], output, **attributes)
+
+
+def test_constants_are_computed() -> None:
+    weights = {"a": np.full((WIDTH,), 2.0, np.float32), "b": np.full((WIDTH,), 3.0, np.float32)}
+    simplified, operators = check(build([node("Mul", ["a", "b"], "ab"), node("Mul", ["x", "ab"], "y")], weights))
+    assert operators == {"Mul": 1}
+    np.testing.assert_array_equal(numpy_helper.to_array(simplified.graph.initializer[0]), np.full(WIDTH, 6.0))
+
+
+def test_reshapes_get_constant_targets() -> None:
+    constants = {
+        "zero": np.array(0, np.int64),
+        "first": np.array([0], np.int64),
+        "rest": np.array([-1, 2, 2], np.int64),
+    }
+    nodes = [
+        node("Shape", ["x"], "shape"),
+        node("Gather", ["shape", "zero"], "batch"),
+        node("Unsqueeze", ["batch", "first"], "batch1"),
+        node("Concat", ["batch1", "rest"], "target", axis=0),
+        node("Reshape", ["x", "target"], "y"),
+    ]
+    simplified, operators = check(build(nodes, constants))
+    assert operators == {"Reshape": 1}
+    assert numpy_helper.to_array(simplified.graph.initializer[0]).tolist() == [0, 0, 2, 2]
+
+
+def test_sizes_are_taken_from_the_input_once() -> None:
+    constants = {"one": np.array(1, np.int64), "half": np.array(0.5, np.float32)}
+    nodes = [
+        node("Mul", ["x", "half"], "z"),
+        node("Shape", ["x"], "shape_x"),
+        node("Gather", ["shape_x", "one"], "count_x"),
+        node("Shape", ["z"], "shape_z"),
+        node("Gather", ["shape_z", "one"], "count_z"),
+        node("Cast", ["count_x"], "n_x", to=TensorProto.FLOAT),
+        node("Cast", ["count_z"], "n_z", to=TensorProto.FLOAT),
+        node("Mul", ["z", "n_x"], "scaled"),
+        node("Add", ["scaled", "n_z"], "y"),
+    ]
+    _, operators = check(build(nodes, constants))
+    assert operators["Shape"] == operators["Gather"] == operators["Cast"] == 1
+
+
+@pytest.mark.parametrize("axes", [[1], [1, 2]])
+def test_means_over_matches_become_products(axes: list[int]) -> None:
+    constants = {"target": np.array([0, 0, 2, 2], np.int64)}
+    nodes = [node("ReduceMean", ["x"], "y", axes=[1], keepdims=1)]
+    if len(axes) == 2:
+        nodes = [node("Reshape", ["x", "target"], "z"), node("ReduceMean", ["z"], "y", axes=axes, keepdims=1)]
+    _, operators = check(build(nodes, constants))
+    assert operators["MatMul"] == 1
+    assert "ReduceMean" not in operators
+
+
+def test_other_means_stay() -> None:
+    _, operators = check(build([node("ReduceMean", ["x"], "y", axes=[2], keepdims=1)]))
+    assert operators == {"ReduceMean": 1}
+
+
+def test_what_holds_only_for_many_matches_is_no_constant() -> None:
+    # min(N, 90) is 90 in two of the three trial runs.
+    constants = {"one": np.array([1], np.int64), "limit": np.array([90], np.int64)}
+    nodes = [
+        node("Shape", ["x"], "shape"),
+        node("Gather", ["shape", "one"], "count"),
+        node("Min", ["count", "limit"], "limited"),
+        node("Cast", ["limited"], "n", to=TensorProto.FLOAT),
+        node("Mul", ["x", "n"], "y"),
+    ]
+    check(build(nodes, constants))
+
+
+def test_sums_before_layer_norm_and_gelu_escape_fusion() -> None:
+    constants = {
+        "bias": np.ones(WIDTH, np.float32),
+        "root": np.array(np.sqrt(2.0), np.float32),
+        "half": np.array(0.5, np.float32),
+        "one": np.array(1.0, np.float32),
+    }
+    nodes = [
+        node("Add", ["x", "x"], "doubled"),
+        node("LayerNormalization", ["doubled", "bias", "bias"], "normal", axis=-1),
+        node("Add", ["normal", "bias"], "shifted"),
+        node("Div", ["shifted", "root"], "scaled"),
+        node("Erf", ["scaled"], "erf"),
+        node("Add", ["erf", "one"], "plus"),
+        node("Mul", ["shifted", "plus"], "product"),
+        node("Mul", ["product", "half"], "y"),
+    ]
+    _, operators = check(build(nodes, constants))
+    assert (operators["Sum"], operators["Add"]) == (2, 1)
+
+
+def test_the_shipped_graph_has_no_sizes_left_to_compute() -> None:
+    operators = Counter(node.op_type for node in onnx.load(str(mgca_filter.model_path())).graph.node)
+    assert operators["Shape"] == 1
+    assert not {"Constant", "ReduceMean", "Identity"} & set(operators)
+
+
+def test_half_weights_halve_the_file_and_hardly_change_the_answer(tmp_path: Path) -> None:
+    source, target = mgca_filter.model_path(), tmp_path / "half.onnx"
+    halve_weights(source, target)
+    assert target.stat().st_size < 0.65 * source.stat().st_size
+    assert onnx.load(str(target)).metadata_props == onnx.load(str(source)).metadata_props
+    rng = np.random.default_rng(0)
+    feed = {
+        "correspondences": rng.uniform(-0.5, 0.5, (1, 200, 4)).astype(np.float32),
+        "attributes": rng.random((1, 200, 8), dtype=np.float32),
+    }
+    logits, halved = (
+        onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"]).run(["logits"], feed)[0]
+        for path in (source, target)
+    )
+    assert 0 < np.abs(halved - logits).max() < 0.5
+    assert np.mean((halved > 0) == (logits > 0)) > 0.98
