@@ -1,6 +1,6 @@
 """Draws the README's picture: RANSAC alone above, mgca_filter below, on the same raw matches of the example pair.
 
-    python examples/before_after.py [--out docs/before_after.png]
+    python examples/before_after.py [--out docs/before_after.jpg]
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def panel(name: str, mask: np.ndarray, pose: tuple, truth: dict, elapsed_ms: flo
 def main() -> None:
     """Match, filter both ways, draw."""
     parser = argparse.ArgumentParser(description="Draw RANSAC alone and mgca_filter on the example pair.")
-    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "before_after.png")
+    parser.add_argument("--out", type=Path, default=ROOT / "docs" / "before_after.jpg")
     options = parser.parse_args()
     truth = json.loads((FOLDER / "pair.json").read_text())
     K = np.array(truth["K1"])
