@@ -31,6 +31,8 @@ SOURCE = Path(__file__).parent.parent / "examples" / "cpp"
 IMAGES = Path(__file__).parent.parent / "examples" / "images"
 K2 = np.array([[700.0, 0.0, 310.0], [0.0, 710.0, 250.0], [0.0, 0.0, 1.0]])
 FOUND, NOTHING_FOUND, ERROR = 0, 1, 2
+# The compiler may take minutes on a busy machine.
+pytestmark = pytest.mark.timeout(1200)
 
 
 # Toolchain and programs
@@ -260,6 +262,13 @@ def test_usage_errors_are_named(program, words, message):
     done = run(program, *words)
     assert done.returncode == ERROR
     assert message in done.stderr
+
+
+def test_unreadable_inputs_are_named(program, model_file, tmp_path):
+    for words in (["--matches", Path(__file__)], ["--matches", tmp_path / "no.yml"], [Path(__file__), "no.png"]):
+        done = run(program, *words, "--model", model_file, "--K", comma_separated(K))
+        assert done.returncode == ERROR
+        assert f"mgca_match_cpp: {words[-1] if words[0] == '--matches' else words[0]}: not a readable" in done.stderr
 
 
 def test_index_out_of_range_is_named(program, small, model_file, tmp_path):

@@ -160,11 +160,19 @@ cv::Mat read_matrix(const cv::FileStorage& storage, const std::string& name, int
     return matrix;
 }
 
-PutativeMatches read_matches(const std::string& file) {
-    const cv::FileStorage storage(file, cv::FileStorage::READ);
-    if (!storage.isOpened()) {
-        throw std::runtime_error(file + ": cannot be opened");
+cv::FileStorage open_storage(const std::string& file) {
+    try {
+        cv::FileStorage storage(file, cv::FileStorage::READ);
+        if (storage.isOpened()) {
+            return storage;
+        }
+    } catch (const cv::Exception&) {  // no YAML, XML or JSON
     }
+    throw std::runtime_error(file + ": not a readable file of cv::FileStorage");
+}
+
+PutativeMatches read_matches(const std::string& file) {
+    const cv::FileStorage storage = open_storage(file);
     PutativeMatches putative;
     for (const auto& [name, keypoints] :
          {std::pair{"keypoints1", &putative.keypoints1}, std::pair{"keypoints2", &putative.keypoints2}}) {
