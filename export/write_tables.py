@@ -40,6 +40,8 @@ def section(summary: dict[str, Any]) -> str:
     scenes = sorted({row["scene"] for row in rows} - {"all", "pairs"})
     pairs = next(row["pairs"] for row in rows if row["scene"] == "pairs")
     versions = summary["versions"]
+    busy = summary["timing"]["share_on_busy_machine"] > 0.05
+    caution = " Times are from a machine busy with other work: rough." if busy else ""
     lines = [
         f"Validation: all {pairs} pairs of {len(scenes)} scenes that training never saw, about ten per cent of the raw "
         "SIFT matches right. Mean over scenes, per cent; a pair without a pose counts as 180°. P, R, F: what enters "
@@ -51,7 +53,8 @@ def section(summary: dict[str, Any]) -> str:
         "",
         *table(rows, "pairs", COLUMNS[:5]),
         "",
-        f"OpenCV {versions.get('opencv-contrib-python-headless', '?')}, {summary['machine'].get('processor', 'CPU')}. "
+        f"OpenCV {versions.get('opencv-contrib-python-headless', '?')}, {summary['machine'].get('processor', 'CPU')}."
+        f"{caution} "
         "Command: `python -m mgca_filter.evaluation BUNDLES`; figures with bootstrap intervals, by scene: "
         "`docs/scoreboard.json`.",
         "",
