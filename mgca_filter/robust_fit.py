@@ -44,7 +44,7 @@ class RobustFitOptions:
     """
 
     method: str = "prosac"
-    threshold_px: float = 0.75
+    threshold_px: float = 0.5
     confidence: float = 0.9999
     max_iterations: int = 5000
     seed: int = 0

@@ -36,7 +36,7 @@ struct Pose {
 
 /// Settings of the robust fit.
 struct RobustFitOptions {
-    double threshold_px = 0.75;        ///< Sampson distance that the estimator takes for an inlier, pixels.
+    double threshold_px = 0.5;         ///< Sampson distance that the estimator takes for an inlier, pixels.
     double refine_threshold_px = 1.0;  ///< Where the refinement cuts the error off, pixels.
     double confidence = 0.999;         ///< Probability that a sample without outliers was drawn.
     int max_iterations = 5000;         ///< Largest number of samples.
