@@ -14,15 +14,7 @@ import numpy as np
 from mgca_filter.evaluation.calibration_fit import collect_logits, expected_calibration_error, fit_calibration
 from mgca_filter.evaluation.methods import BoolArray, FloatArray
 from mgca_filter.scene_bundle import SceneBundle, ScenePair
-
-
-def choose_pairs(paths: list[Path], per_scene: int) -> list[ScenePair]:
-    """At most ``per_scene`` pairs of each bundle, evenly spaced."""
-    chosen = []
-    for bundle in map(SceneBundle, paths):
-        for index in np.unique(np.linspace(0, len(bundle) - 1, min(per_scene, len(bundle))).astype(int)):
-            chosen.append(bundle[int(index)])
-    return chosen
+from mgca_filter.training.validation import select_pairs
 
 
 def gather(model: Path, pairs: list[ScenePair]) -> tuple[FloatArray, BoolArray]:
@@ -39,7 +31,8 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--per-scene", type=int, default=24)
     options = parser.parse_args()
-    pairs = choose_pairs([options.bundles / f"{scene}.npz" for scene in options.scenes], options.per_scene)
+    bundles = [SceneBundle(options.bundles / f"{scene}.npz") for scene in options.scenes]
+    pairs = select_pairs(bundles, options.per_scene)
     calibration = fit_calibration(*gather(options.model, pairs[::2]))
     logits, truth = gather(options.model, pairs[1::2])
     error = expected_calibration_error(calibration.probabilities(logits).astype(float), truth)

@@ -12,8 +12,8 @@ from ..epipolar import symmetric_epipolar_distance_squared
 from ..match_filter import MatchFilter
 from ..scene_bundle import ScenePair
 from .methods import BoolArray, FloatArray
+from .metrics import TRUE_INLIER_DISTANCE_SQUARED
 
-INLIER_DISTANCE = 1e-4  # squared symmetric epipolar distance, normalised: the field's ground truth
 _NEWTON_STEPS = 50
 _RIDGE = 1e-9
 
@@ -28,7 +28,7 @@ def collect_logits(model: str | Path, pairs: Sequence[ScenePair]) -> tuple[list[
         )
         logits.append(np.asarray(result.info["logits"], dtype=np.float64))
         distance = symmetric_epipolar_distance_squared(pair.correspondences, pair.E)
-        truth.append(np.asarray(distance < INLIER_DISTANCE))
+        truth.append(np.asarray(distance < TRUE_INLIER_DISTANCE_SQUARED))
     return logits, truth
 
 

@@ -10,12 +10,15 @@ from numpy.typing import NDArray
 
 from ..correspondences import candidate_mask, mean_focal_length
 from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
+from ..evaluation.metrics import (
+    FAILURE_DEG,
+    TRUE_INLIER_DISTANCE_SQUARED,
+    mean_average_precision,
+    precision_recall_f,
+)
 from ..network import MGCANet
 from ..robust_fit import estimate_pose, match_order, pose_from_essential
 from ..scene_bundle import SceneBundle, ScenePair
-
-LABEL_DISTANCE = 1e-4
-FAILURE_DEG = 180.0
 
 
 def select_pairs(bundles: Sequence[SceneBundle], per_scene: int) -> list[ScenePair]:
@@ -37,8 +40,8 @@ def quick_validation(network: MGCANet, pairs: Iterable[ScenePair]) -> dict[str, 
     precision, recall, fit, own = np.array(rows, dtype=np.float64).T
     result = {"precision": precision.mean(), "recall": recall.mean()}
     for name, errors in (("fit", fit), ("essential", own)):
-        result[f"{name}_mAP@5"] = np.mean(errors < 5)
-        result[f"{name}_mAP@20"] = np.mean([np.mean(errors < limit) for limit in (5, 10, 15, 20)])
+        for limit in (5, 20):
+            result[f"{name}_mAP@{limit}"] = mean_average_precision(errors, limit)
     return {name: 100.0 * float(value) for name, value in result.items()}
 
 
@@ -49,10 +52,10 @@ def _evaluate_pair(network: MGCANet, pair: ScenePair) -> tuple[float, float, flo
     x, attributes = pair.correspondences[rows], encoded[rows]
     output = network(torch.from_numpy(x.astype(np.float32))[None], torch.from_numpy(attributes)[None])
     logits = output.logits[0].numpy()
-    truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < LABEL_DISTANCE
-    right = int(np.count_nonzero(truth[rows] & (logits > 0)))
-    precision = right / max(int(np.count_nonzero(logits > 0)), 1)
-    recall = right / max(int(np.count_nonzero(truth)), 1)
+    truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
+    accepted = np.zeros(len(truth), dtype=bool)
+    accepted[rows] = logits > 0
+    precision, recall, _ = precision_recall_f(accepted, truth)
     scores = 1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0)))
     order = match_order(scores.astype(np.float32), attributes[:, 0], attributes[:, 5] > 0)
     kept = order[logits[order] > 0]
