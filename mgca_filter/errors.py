@@ -15,5 +15,9 @@ class BackendError(MgcaFilterError):
     """An inference backend could not be started or refused its input."""
 
 
-class BundleError(MgcaFilterError, ValueError):
+class DatasetError(MgcaFilterError, ValueError):
+    """Pairs with known pose cannot be read, or hold values that cannot be; the message names file and field."""
+
+
+class BundleError(DatasetError):
     """A scene bundle lacks a field or holds values that cannot be; the message names file and field."""
