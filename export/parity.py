@@ -20,8 +20,7 @@ import numpy as np
 import mgca_filter
 from mgca_filter import BackendError
 from mgca_filter.backends import Backend, open_backend
-from mgca_filter.match_filter import MatchPair
-from mgca_filter.pair_input import prepare_pair
+from mgca_filter.pair_input import MatchPair, prepare_pair
 from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.scoring import select_network_input
 
@@ -199,7 +198,7 @@ def real_inputs(model: Path, folder: Path) -> list[Inputs]:
         for index in np.unique(np.linspace(0, len(bundle) - 1, PAIRS_PER_SCENE).astype(int)):
             pair = bundle[int(index)]
             arrays = MatchPair(pair.points1, pair.points2, None, pair.K1, pair.K2, attributes=pair.attributes)
-            prepared = prepare_pair(**vars(arrays))
+            prepared = prepare_pair(arrays)
             sent = select_network_input(prepared.correspondences, prepared.attributes, prepared.valid, backend, seed=0)
             inputs.append((sent.correspondences[None], sent.attributes[None]))
     return inputs

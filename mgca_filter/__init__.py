@@ -8,7 +8,8 @@ Matplotlib; ONNX Runtime is loaded when the first model is opened.
 from .correspondences import MatchAttributes
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
 from .image_matching import ImageMatchResult, match_images
-from .match_filter import MatchFilter, MatchPair, filter_many, filter_matches, model_path
+from .match_filter import MatchFilter, filter_many, filter_matches, model_path
+from .pair_input import MatchPair
 from .result import FilterResult, Status
 
 __version__ = "0.1.0"

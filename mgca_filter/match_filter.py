@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from .backends import BACKENDS, Providers, shared_backend
 from .correspondences import MatchAttributes
 from .option_checks import check_choice, check_number, check_path, check_providers, check_seed
-from .pair_input import PairInput, prepare_pair
+from .pair_input import MatchPair, PairInput, prepare_pair
 from .result import FilterResult, Status
 from .robust_fit import METHODS, MIN_MATCHES, RobustFitOptions, estimate_model, match_order
 from .scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_for_fit, select_network_input
@@ -28,22 +28,6 @@ _BATCH_PAIRS = 8
 def model_path() -> Path:
     """Where the ONNX file of the shipped model lies."""
     return Path(__file__).resolve().parent / "models" / "mgca_small.onnx"
-
-
-@dataclass(frozen=True)
-class MatchPair:
-    """Arguments of one pair for :func:`filter_many`; fields as in :func:`filter_matches`."""
-
-    kp1: Any
-    kp2: Any
-    matches: Any
-    K1: Any = None
-    K2: Any = None
-    dist1: Any = None
-    dist2: Any = None
-    size1: Any = None
-    size2: Any = None
-    attributes: MatchAttributes | None = None
 
 
 class MatchFilter:
@@ -133,7 +117,7 @@ class MatchFilter:
             pair = MatchPair(*pair)
         if not isinstance(pair, MatchPair):
             raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
-        prepared = prepare_pair(**{f.name: getattr(pair, f.name) for f in fields(pair)})
+        prepared = prepare_pair(pair)
         sent = select_network_input(
             prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.fit_options.seed
         )
@@ -267,18 +251,8 @@ def filter_matches(
         backend=backend,
         seed=seed,
     )
-    return match_filter.filter(
-        kp1,
-        kp2,
-        matches,
-        K1=K1,
-        K2=K2,
-        dist1=dist1,
-        dist2=dist2,
-        size1=size1,
-        size2=size2,
-        attributes=attributes,
-    )
+    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)
+    return match_filter.filter_many([pair])[0]
 
 
 def filter_many(pairs: Iterable[MatchPair | tuple[Any, Any, Any]], **options: Any) -> list[FilterResult]:

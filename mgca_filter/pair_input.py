@@ -18,6 +18,22 @@ _MAX_NORMALIZED = 1e3
 
 
 @dataclass(frozen=True)
+class MatchPair:
+    """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`."""
+
+    kp1: Any
+    kp2: Any
+    matches: Any
+    K1: Any = None
+    K2: Any = None
+    dist1: Any = None
+    dist2: Any = None
+    size1: Any = None
+    size2: Any = None
+    attributes: MatchAttributes | None = None
+
+
+@dataclass(frozen=True)
 class PairInput:
     """Matches of a pair, M rows in the order of the input.
 
@@ -52,29 +68,16 @@ class PairInput:
         return self.intrinsics1.project(selected[:, :2]), self.intrinsics2.project(selected[:, 2:])
 
 
-def prepare_pair(
-    kp1: Any,
-    kp2: Any,
-    matches: Any,
-    *,
-    K1: Any = None,
-    K2: Any = None,
-    dist1: Any = None,
-    dist2: Any = None,
-    size1: Any = None,
-    size2: Any = None,
-    attributes: MatchAttributes | None = None,
-) -> PairInput:
-    """Read everything that the caller knows of a pair; arguments as in :func:`mgca_filter.filter_matches`.
+def prepare_pair(pair: MatchPair) -> PairInput:
+    """Read everything that the caller knows of a pair.
 
     Raises:
-        TypeError, ValueError: an argument is of another type, shape, length or range.
+        TypeError, ValueError: a field is of another type, shape, length or range.
     """
-    keypoints1, keypoints2 = read_keypoints(kp1, "kp1"), read_keypoints(kp2, "kp2")
-    putative = read_matches(matches, len(keypoints1), len(keypoints2))
-    intrinsics1, intrinsics2 = resolve_intrinsics(
-        keypoints1.points, keypoints2.points, K1=K1, K2=K2, dist1=dist1, dist2=dist2, size1=size1, size2=size2
-    )
+    keypoints1, keypoints2 = read_keypoints(pair.kp1, "kp1"), read_keypoints(pair.kp2, "kp2")
+    putative = read_matches(pair.matches, len(keypoints1), len(keypoints2))
+    cameras = {name: getattr(pair, name) for name in ("K1", "K2", "dist1", "dist2", "size1", "size2")}
+    intrinsics1, intrinsics2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
     present = (putative.index1 >= 0)[:, None]
     if present.any():
         x1 = np.where(present, intrinsics1.normalize(keypoints1.points)[putative.index1], np.nan)
@@ -84,7 +87,7 @@ def prepare_pair(
     correspondences = np.hstack([x1, x2])
     with np.errstate(invalid="ignore"):
         valid = (np.abs(correspondences) < _MAX_NORMALIZED).all(axis=1)
-    known = _merge_attributes(putative, keypoints1, keypoints2, attributes)
+    known = _merge_attributes(putative, keypoints1, keypoints2, pair.attributes)
     return PairInput(putative, correspondences, valid, known.encode(len(putative)), intrinsics1, intrinsics2)
 
 

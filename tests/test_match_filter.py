@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from inspect import signature
 from pathlib import Path
 
 import cv2
@@ -35,6 +36,16 @@ def test_three_positional_arguments_are_enough(scene: Scene, model_file: Path) -
     assert result.info["intrinsics"] == "guessed"
     assert len(result.info["assumptions"]) == 2
     assert np.mean(result.mask == scene.inlier) > 0.95
+
+
+def test_the_doors_take_the_same_arguments() -> None:
+    """The lists that a reader sees are written out; none of them may fall behind."""
+    pair, options = signature(MatchPair).parameters, signature(MatchFilter).parameters
+    function, method = signature(filter_matches).parameters, signature(MatchFilter.filter).parameters
+    assert {name: p.default for name, p in function.items()} == {
+        name: p.default for name, p in {**pair, **options}.items()
+    }
+    assert [(p.name, p.default) for p in method.values()][1:] == [(p.name, p.default) for p in pair.values()]
 
 
 def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:
