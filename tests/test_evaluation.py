@@ -15,18 +15,19 @@ from scene_bundles import write_bundle
 
 from mgca_filter import filter_matches
 from mgca_filter.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
-from mgca_filter.errors import BundleError
+from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.evaluation import predict as predict_module
 from mgca_filter.evaluation.__main__ import main
-from mgca_filter.evaluation.baselines import OpenCvEstimator, PoseLibEstimator, pose_from_essential
 from mgca_filter.evaluation.environment import CpuMeter
-from mgca_filter.evaluation.methods import Answer, PairOutcome, Selection
+from mgca_filter.evaluation.estimators import OpenCvEstimator, PoseLibEstimator, pose_from_essential
+from mgca_filter.evaluation.methods import Answer, PairOutcome
 from mgca_filter.evaluation.metrics import precision_recall_f
 from mgca_filter.evaluation.pairs import draw_indices, iterate_pairs, select_pairs
 from mgca_filter.evaluation.predict import evaluate_pair, predict
 from mgca_filter.evaluation.product import pose_by_paper_protocol, pose_without_ransac
 from mgca_filter.evaluation.registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
 from mgca_filter.evaluation.report import format_report, summarize
+from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.store import ResultStore
 from mgca_filter.scene_bundle import ScenePair
 
@@ -114,7 +115,7 @@ def test_selection_covers_a_folder_one_file_or_named_scenes(folder):
 
 
 def test_bundles_that_cannot_be_used_are_named(folder, tmp_path):
-    with pytest.raises(BundleError, match="no scene bundle named cellar"):
+    with pytest.raises(DatasetError, match="no scene named cellar"):
         select_pairs(folder, ["cellar", "hall"])
     with pytest.raises(BundleError, match="no scene bundle"):
         select_pairs(tmp_path)
@@ -135,7 +136,18 @@ def test_a_rows_name_gives_the_row(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["RANSAC", "NN + LMEDS 1 px", "best + RANSAC 1 px", "NN + RANSAC 0 px", "ratio 2 + MAGSAC 1 px", "", "NN +"]
+    "name",
+    [
+        "RANSAC",
+        "NN + LMEDS 1 px",
+        "NN + network order + MAGSAC 1 px",
+        "NN + network order + product",
+        "best + RANSAC 1 px",
+        "NN + RANSAC 0 px",
+        "ratio 2 + MAGSAC 1 px",
+        "",
+        "NN +",
+    ],
 )
 def test_other_names_are_refused(name):
     with pytest.raises(ValueError, match="expected|positive"):
@@ -470,7 +482,7 @@ def test_command_names_what_is_wrong(folder, tmp_path, capsys):
     (tmp_path / "torn.npz").write_bytes(b"no bundle")
     assert main([str(tmp_path), "--methods", PROSAC, "-q"]) == 2
     assert "torn.npz" in capsys.readouterr().err
-    assert main([str(folder), "--methods", "NN + LMEDS", "-q"]) == 2
-    assert "NN + LMEDS" in capsys.readouterr().err
+    assert main([str(folder), "--methods", "NN + LMEDS 2 px", "-q"]) == 2
+    assert "NN + LMEDS 2 px" in capsys.readouterr().err
     assert main([str(folder), "--methods", "product", "--model", str(tmp_path / "absent.onnx"), "-q"]) == 2
     assert "absent.onnx" in capsys.readouterr().err

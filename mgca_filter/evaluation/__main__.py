@@ -1,4 +1,4 @@
-"""The scoreboard command: ``python -m mgca_filter.evaluation PATH``."""
+"""The scoreboard command: ``python -m mgca_filter.evaluation PATH…``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from .pairs import select_pairs
 from .predict import predict
 from .registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
 from .report import format_report, summarize
+from .sources import FORMATS
 from .store import ResultStore
 
 logger = logging.getLogger(__name__)
@@ -27,7 +28,15 @@ def build_parser() -> argparse.ArgumentParser:
         description="Relative pose from putative matches: the filter and its rivals on the same pairs.",
         epilog=f"Methods by default: {'; '.join([*RIVAL_ROWS, *PRODUCT_ROWS])}.",
     )
-    parser.add_argument("path", metavar="PATH", help="folder of scene bundles (.npz), or one bundle")
+    parser.add_argument("path", nargs="+", metavar="PATH", help="files, folders of files, or COLMAP reconstructions")
+    parser.add_argument(
+        "--format",
+        choices=tuple(FORMATS),
+        default="bundle",
+        help="scene bundles (.npz, the default), OANet's HDF5 dumps, SuperGlue's lists of image pairs with their pose, "
+        "or COLMAP reconstructions with their images",
+    )
+    parser.add_argument("--images", metavar="DIR", help="where image names start (default: beside list or model)")
     parser.add_argument("--scenes", nargs="+", metavar="NAME", help="these scenes only")
     parser.add_argument("--per-scene", type=_positive, metavar="N", help="at most N pairs of a scene, drawn by --seed")
     parser.add_argument(
@@ -95,9 +104,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> dict[str, object]:
     """Draw the pairs, run the methods, and sum up."""
     methods = [parse_method(name, options.model) for name in _expand(options.methods)]
-    selections = select_pairs(options.path, options.scenes, options.per_scene, options.seed)
+    selections = select_pairs(
+        options.path,
+        options.scenes,
+        options.per_scene,
+        options.seed,
+        data_format=options.format,
+        images=options.images,
+    )
+    store = ResultStore(options.store)
     results = predict(
-        methods, selections, seeds=options.seeds, workers=options.workers, store=ResultStore(options.store)
+        methods,
+        selections,
+        seeds=options.seeds,
+        workers=options.workers,
+        store=store,
+        progress=not options.quiet,
     )
     context = {
         "seed": options.seed,
@@ -105,6 +127,7 @@ def run(options: argparse.Namespace) -> dict[str, object]:
         "commit": source_commit(),
         "machine": machine_description(),
         "settings": {
+            "format": options.format,
             "per_scene": options.per_scene,
             "seeds": options.seeds,
             "workers": options.workers,

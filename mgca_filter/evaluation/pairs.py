@@ -1,8 +1,7 @@
-"""Which pairs of which scene bundles are evaluated."""
+"""Which pairs of which scenes are evaluated."""
 
 from __future__ import annotations
 
-import hashlib
 import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
@@ -10,18 +9,27 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import BundleError
-from ..scene_bundle import SceneBundle, ScenePair
+from ..errors import DatasetError
+from ..scene_bundle import ScenePair
+from .sources import PairSource, open_sources
 
 
 @dataclass(frozen=True)
 class SceneSelection:
-    """The chosen pairs of one bundle file: ascending ``indices`` and the SHA-256 of the file they come from."""
+    """The chosen pairs of one scene: ascending ``indices`` into its source."""
 
-    path: Path
-    scene: str
-    sha256: str
+    source: PairSource
     indices: tuple[int, ...]
+
+    @property
+    def scene(self) -> str:
+        """Name of the scene."""
+        return self.source.scene
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the data that the pairs come from."""
+        return self.source.sha256
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -40,48 +48,45 @@ def draw_indices(count: int, scene: str, per_scene: int | None, seed: int) -> tu
 
 
 def select_pairs(
-    path: str | Path, scenes: Collection[str] | None = None, per_scene: int | None = None, seed: int = 0
+    paths: str | Path | Sequence[str | Path],
+    scenes: Collection[str] | None = None,
+    per_scene: int | None = None,
+    seed: int = 0,
+    *,
+    data_format: str = "bundle",
+    images: str | Path | None = None,
 ) -> list[SceneSelection]:
-    """Choose pairs from every bundle of a folder (or from the one file that ``path`` names), in order of the names.
+    """Choose pairs from every scene that the paths hold.
 
-    Each file is read once here, so that a broken bundle stops a run before it starts.
+    What can be checked without reading every pair is checked here, so that a file that is broken stops a run before it
+    starts. A pair that turns out broken later counts as a failure of every method.
 
     Args:
-        path: folder of ``.npz`` scene bundles, or one bundle.
+        paths: files or folders, as :func:`sources.open_sources` takes them; one or several.
         scenes: keep these scenes only; None keeps all.
         per_scene: cap on the pairs of a scene, at least 1; None takes all of them.
         seed: of the draw that the cap makes.
+        data_format, images: as in :func:`sources.open_sources`.
 
     Raises:
-        BundleError: there is no bundle, a wanted scene is not there, or a file is broken or holds no pair.
-        ValueError: ``per_scene`` is below 1.
+        DatasetError: there is no scene, a wanted one is not there, or a file is broken or holds no pair.
+        ValueError: ``per_scene`` is below 1, or the format is unknown.
+        ImportError: the package that reads the format is not installed.
     """
     if per_scene is not None and per_scene < 1:
         raise ValueError(f"per_scene must be at least 1 or None, got {per_scene}")
-    path = Path(path)
-    files = [path] if path.is_file() else sorted(path.glob("*.npz"))
-    if not files:
-        raise BundleError(f"{path}: no scene bundle (.npz) found")
+    listed = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    sources = open_sources(listed, data_format, images)
     if scenes is not None:
-        absent = sorted(set(scenes) - {file.stem for file in files})
+        absent = sorted(set(scenes) - {source.scene for source in sources})
         if absent:
-            raise BundleError(f"{path}: no scene bundle named {', '.join(absent)}")
-        files = [file for file in files if file.stem in set(scenes)]
-    chosen = []
-    for file in files:
-        bundle = SceneBundle(file)
-        if len(bundle) == 0:
-            raise BundleError(f"{file}: holds no pair")
-        digest = hashlib.sha256(file.read_bytes()).hexdigest()
-        chosen.append(
-            SceneSelection(file, bundle.scene, digest, draw_indices(len(bundle), bundle.scene, per_scene, seed))
-        )
-    return chosen
+            raise DatasetError(f"{', '.join(map(str, listed))}: no scene named {', '.join(absent)}")
+        sources = [source for source in sources if source.scene in set(scenes)]
+    return [SceneSelection(s, draw_indices(len(s), s.scene, per_scene, seed)) for s in sources]
 
 
 def iterate_pairs(selections: Sequence[SceneSelection]) -> Iterator[ScenePair]:
-    """The chosen pairs, scene by scene, with one bundle in memory at a time."""
+    """The chosen pairs, scene by scene."""
     for selection in selections:
-        bundle = SceneBundle(selection.path)
         for index in selection.indices:
-            yield bundle[index]
+            yield selection.source[index]

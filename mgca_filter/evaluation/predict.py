@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import logging
 import time
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from multiprocessing import get_context
-from pathlib import Path
 
 import cv2
 import numpy as np
 
 from ..epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
-from ..scene_bundle import SceneBundle, ScenePair
+from ..errors import DatasetError
+from ..scene_bundle import ScenePair
 from .environment import CpuMeter, processor_name
-from .methods import Answer, Method, PairOutcome
-from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
+from .methods import UNREADABLE, Answer, Method, PairOutcome
+from .metrics import FAILURE_DEG, PAPER_LOGIT, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
 from .pairs import SceneSelection
+from .progress import Progress
+from .score_counts import count_scores
+from .sources import PairSource
 from .store import ResultKey, ResultStore
 
 logger = logging.getLogger(__name__)
@@ -28,6 +31,7 @@ CHUNK_PAIRS = 40
 """Pairs between two writes to the store: what an interrupted run loses at most, per worker."""
 
 _warm_methods: set[str] = set()
+_read_pairs: OrderedDict[tuple[str, str, int], ScenePair | DatasetError] = OrderedDict()
 
 SceneOutcomes = dict[str, list[list[PairOutcome]]]
 """Outcomes by scene: one list per seed, each in the order of the pairs."""
@@ -37,7 +41,7 @@ SceneOutcomes = dict[str, list[list[PairOutcome]]]
 class _Task:
     method: Method
     key: ResultKey
-    path: Path
+    source: PairSource
     indices: tuple[int, ...]
 
 
@@ -48,6 +52,7 @@ def predict(
     seeds: int = 3,
     workers: int = 1,
     store: ResultStore | None = None,
+    progress: bool = False,
 ) -> dict[str, SceneOutcomes]:
     """Outcomes of every method on every chosen pair, by name of the method and scene.
 
@@ -59,9 +64,11 @@ def predict(
         seeds: number of runs, seeds 0 … seeds − 1, of the methods whose ``seeded`` is True; the others run once.
         workers: processes; 1 runs everything in this one.
         store: where results are looked up and kept; None keeps them in memory.
+        progress: show a bar on standard error.
+
+    What a method raises counts as a failure of the pair, and so does a pair that cannot be read: then of every method.
 
     Raises:
-        BundleError: a pair of a bundle is broken. What a method raises counts as a failure of the pair instead.
         ValueError: ``seeds`` or ``workers`` is below 1, or two methods share a name.
     """
     if seeds < 1 or workers < 1:
@@ -72,12 +79,11 @@ def predict(
     keys = _result_keys(methods, selections, seeds)
     tasks = list(_missing_tasks(methods, selections, keys, store))
     total = sum(len(task.indices) for task in tasks)
-    logger.info("%d pairs to run, %d tasks", total, len(tasks))
-    done = 0
-    for task, outcomes in _run_tasks(tasks, workers):
-        store.add(task.key, outcomes)
-        done += len(outcomes)
-        logger.info("%d/%d  %s, %s, seed %d", done, total, task.key.method, task.key.scene, task.key.seed)
+    logger.info("%d pairs to run, the others are in the store", total)
+    with Progress(total, progress) as bar:
+        for task, outcomes in _run_tasks(tasks, workers):
+            store.add(task.key, outcomes)
+            bar.advance(len(outcomes), f"{task.key.method}, {task.key.scene}, seed {task.key.seed}")
     results: dict[str, SceneOutcomes] = {}
     for method in methods:
         results[method.name] = {}
@@ -108,13 +114,16 @@ def _missing_tasks(
     keys: dict[tuple[str, str], list[ResultKey]],
     store: ResultStore,
 ) -> Iterator[_Task]:
-    for method in methods:
-        for selection in selections:
-            for key in keys[method.name, selection.scene]:
-                known = store.load(key)
-                missing = [index for index in selection.indices if index not in known]
-                for first in range(0, len(missing), CHUNK_PAIRS):
-                    yield _Task(method, key, selection.path, tuple(missing[first : first + CHUNK_PAIRS]))
+    """Chunk by chunk, all methods on each: pairs that are slow to read are read once for all of them."""
+    for selection in selections:
+        known = {method.name: [set(store.load(k)) for k in keys[method.name, selection.scene]] for method in methods}
+        for first in range(0, len(selection), CHUNK_PAIRS):
+            chunk = selection.indices[first : first + CHUNK_PAIRS]
+            for method in methods:
+                for key, done in zip(keys[method.name, selection.scene], known[method.name]):
+                    missing = tuple(index for index in chunk if index not in done)
+                    if missing:
+                        yield _Task(method, key, selection.source, missing)
 
 
 def _run_tasks(tasks: list[_Task], workers: int) -> Iterator[tuple[_Task, list[PairOutcome]]]:
@@ -137,9 +146,17 @@ def _run_tasks(tasks: list[_Task], workers: int) -> Iterator[tuple[_Task, list[P
             raise
 
 
-@lru_cache(maxsize=2)
-def _bundle(path: Path, modified_ns: int) -> SceneBundle:
-    return SceneBundle(path)
+def _read_pair(source: PairSource, index: int) -> ScenePair | DatasetError:
+    """The pair, or why it cannot be read; the latest of them are kept, for the methods that come next."""
+    key = (source.scene, source.sha256, index)
+    if key not in _read_pairs:
+        try:
+            _read_pairs[key] = source[index]
+        except DatasetError as error:
+            _read_pairs[key] = error
+        if len(_read_pairs) > 2 * CHUNK_PAIRS:
+            _read_pairs.popitem(last=False)
+    return _read_pairs[key]
 
 
 def _warm_up(method: Method, pair: ScenePair) -> None:
@@ -151,12 +168,26 @@ def _warm_up(method: Method, pair: ScenePair) -> None:
 
 def _run_task(task: _Task) -> list[PairOutcome]:
     cv2.setNumThreads(1)
-    bundle = _bundle(task.path, task.path.stat().st_mtime_ns)
-    _warm_up(task.method, bundle[task.indices[0]])
+    # All are read before the clock of the others' work starts: reading may take several threads.
+    pairs = [_read_pair(task.source, index) for index in task.indices]
+    readable = [pair for pair in pairs if isinstance(pair, ScenePair)]
+    if readable:
+        _warm_up(task.method, readable[0])
     meter = CpuMeter()
-    measured = [evaluate_pair(task.method, bundle[index], task.key.seed) for index in task.indices]
+    outcomes = [
+        evaluate_pair(task.method, pair, task.key.seed)
+        if isinstance(pair, ScenePair)
+        else _unreadable_outcome(index, pair)
+        for index, pair in zip(task.indices, pairs)
+    ]
     busy, machine = meter.others_were_busy(), processor_name()
-    return [replace(outcome, busy=busy, machine=machine) for outcome in measured]
+    return [replace(outcome, busy=busy, machine=machine) for outcome in outcomes]
+
+
+def _unreadable_outcome(index: int, error: DatasetError) -> PairOutcome:
+    """A failure in every figure: no pose, nothing found."""
+    nothing = (0.0, 0.0, 0.0)
+    return PairOutcome(index, FAILURE_DEG, None, None, nothing, nothing, 0.0, 0.0, f"{UNREADABLE}{error}")
 
 
 def _answer(method: Method, pair: ScenePair, seed: int) -> Answer:
@@ -183,6 +214,10 @@ def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
         error_deg = max(rotation_deg, translation_deg)
     elif not failure:
         failure = "no pose"
+    paper = counts = None
+    if answer.logits is not None and answer.scores is not None:
+        paper = precision_recall_f(answer.logits > PAPER_LOGIT, truth)
+        counts = count_scores(answer.logits, answer.scores, truth)
     return PairOutcome(
         pair=pair.index,
         error_deg=error_deg,
@@ -193,4 +228,6 @@ def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
         elapsed_ms=elapsed_ms,
         cpu_ms=cpu_ms,
         failure=failure,
+        paper=paper,
+        counts=counts,
     )

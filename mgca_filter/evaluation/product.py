@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from ..correspondences import MatchAttributes, normalize_points
 from ..result import FilterResult
 from ..scene_bundle import ScenePair
-from .baselines import REVISION, pose_from_essential
-from .methods import MIN_MATCHES, Answer, FloatArray, PoseEstimate, Selection
+from .baselines import REVISION
+from .estimators import Estimator, pose_from_essential
+from .methods import MIN_MATCHES, Answer, FloatArray, PoseEstimate
+from .selection import Selection
 
 VARIANTS = {
     "product": "filter_matches, default options, with attributes, intrinsics and image sizes",
@@ -26,6 +28,9 @@ VARIANTS = {
     "network RANSAC": "findEssentialMat(RANSAC, 1e-3 normalised) on the matches of logit > 0, the papers' protocol",
 }
 """Names of the rows and what they run."""
+
+NETWORK_ORDER = "network order"
+"""Part of a row's name: the estimator behind it gets the plain matches, best logit first."""
 
 BEST_SHARE = 0.1
 PAPER_THRESHOLD_NORM = 1e-3
@@ -49,22 +54,11 @@ class ProductMethod:
         return self.variant == "product poselib"
 
     def settings(self) -> dict[str, Any]:
-        import onnxruntime
-
-        from mgca_filter import MatchFilter, model_path
-
-        # Opened here once, so that a model that cannot be used stops the run instead of failing every pair.
-        MatchFilter(**self._options(seed=0))
-        path = Path(model_path() if self.model is None else self.model)
         settings = {
             "revision": REVISION,
             "variant": self.variant,
-            "selection": asdict(self.selection),
-            "model": path.name,
-            "model_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
-            "source_sha256": runtime_source_digest(),
-            "opencv": cv2.__version__,
-            "onnxruntime": onnxruntime.__version__,
+            "selection": self.selection.settings(),
+            **model_settings(self.model, self._options(seed=0)),
         }
         if self.variant == "product poselib":
             import poselib
@@ -75,7 +69,7 @@ class ProductMethod:
     def run(self, pair: ScenePair, seed: int) -> Answer:
         kept = self.selection.apply(pair)
         rows = np.flatnonzero(kept)
-        result = self._filter(pair, rows, seed)
+        result = filter_pair(pair, rows, self.model, self._options(seed), bare=self.variant == "product bare")
         logits = np.asarray(result.info["logits"], dtype=np.float64)
         if self.variant.startswith("product"):
             estimate = _pose_of_result(result)
@@ -86,35 +80,102 @@ class ProductMethod:
                 estimate = pose_without_ransac(result.info.get("network_essential"), logits, x1, x2)
             else:
                 estimate = pose_by_paper_protocol(logits, x1, x2)
-        kept[rows] = logits > 0
+        # What the selection took away counts as rejected with certainty.
+        all_logits, scores = np.full(len(kept), -np.inf), np.zeros(len(kept))
+        all_logits[rows], scores[rows] = logits, result.scores
         mask = np.zeros(len(kept), dtype=bool)
         mask[rows] = estimate.inliers
-        return Answer(estimate.R, estimate.t, kept, mask, estimate.failure)
-
-    def _filter(self, pair: ScenePair, rows: NDArray[np.intp], seed: int) -> FilterResult:
-        from mgca_filter import filter_matches
-
-        attributes: MatchAttributes | None = None if self.variant == "product bare" else pair.attributes.take(rows)
-        return filter_matches(
-            pair.points1[rows],
-            pair.points2[rows],
-            None,
-            K1=pair.K1,
-            K2=pair.K2,
-            size1=pair.image_size1,
-            size2=pair.image_size2,
-            attributes=attributes,
-            **self._options(seed),
-        )
+        return Answer(estimate.R, estimate.t, all_logits > 0, mask, estimate.failure, all_logits, scores)
 
     def _options(self, seed: int) -> dict[str, Any]:
         """What differs from the defaults of ``filter_matches``."""
-        options: dict[str, Any] = {} if self.model is None else {"model": self.model}
         if self.variant == "product poselib":
-            options |= {"method": "poselib", "seed": seed}
-        elif self.variant.startswith("network"):
-            options["method"] = "none"
-        return options
+            return {"method": "poselib", "seed": seed}
+        return {"method": "none"} if self.variant.startswith("network") else {}
+
+
+@dataclass(frozen=True)
+class NetworkOrderMethod:
+    """A rival's matches and estimator, sorted by the network's logits in the place of the ratio."""
+
+    selection: Selection
+    estimator: Estimator
+    model: str | None = None
+
+    @property
+    def name(self) -> str:
+        return " + ".join([*(self.selection.parts or ["NN"]), NETWORK_ORDER, self.estimator.name])
+
+    @property
+    def seeded(self) -> bool:
+        return self.estimator.seeded
+
+    def settings(self) -> dict[str, Any]:
+        return {
+            "revision": REVISION,
+            "variant": NETWORK_ORDER,
+            "selection": self.selection.settings(),
+            "estimator": self.estimator.settings(),
+            **model_settings(self.model, {"method": "none"}),
+        }
+
+    def run(self, pair: ScenePair, seed: int) -> Answer:
+        result = filter_pair(pair, np.arange(len(pair.points1)), self.model, {"method": "none"})
+        logits = np.asarray(result.info["logits"], dtype=np.float64)
+        scores = np.asarray(result.scores, dtype=np.float64)
+        kept = self.selection.apply(pair)
+        rows = np.flatnonzero(kept)
+        mask = np.zeros(len(kept), dtype=bool)
+        if len(rows) < MIN_MATCHES:
+            return Answer(None, None, kept, mask, "fewer than 5 matches", logits, scores)
+        rows = rows[np.argsort(-logits[rows], kind="stable")]
+        estimate = self.estimator.estimate(pair, rows, seed)
+        mask[rows] = estimate.inliers
+        return Answer(estimate.R, estimate.t, kept, mask, estimate.failure, logits, scores)
+
+
+def filter_pair(
+    pair: ScenePair, rows: NDArray[np.intp], model: str | None, options: dict[str, Any], *, bare: bool = False
+) -> FilterResult:
+    """What ``filter_matches`` says of the matches ``rows`` (N,); ``bare`` withholds their attributes."""
+    from mgca_filter import filter_matches
+
+    attributes: MatchAttributes | None = None if bare else pair.attributes.take(rows)
+    return filter_matches(
+        pair.points1[rows],
+        pair.points2[rows],
+        None,
+        K1=pair.K1,
+        K2=pair.K2,
+        size1=pair.image_size1,
+        size2=pair.image_size2,
+        attributes=attributes,
+        model=model,
+        **options,
+    )
+
+
+def model_settings(model: str | None, options: dict[str, Any]) -> dict[str, Any]:
+    """Hashes and versions that an answer of the filter depends on.
+
+    The filter is opened once here, so that a model that cannot be used stops the run instead of failing every pair.
+
+    Raises:
+        ModelError, BackendError, ImportError: as :class:`mgca_filter.MatchFilter`.
+    """
+    import onnxruntime
+
+    from mgca_filter import MatchFilter, model_path
+
+    MatchFilter(model=model, **options)
+    path = Path(model_path() if model is None else model)
+    return {
+        "model": path.name,
+        "model_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "source_sha256": runtime_source_digest(),
+        "opencv": cv2.__version__,
+        "onnxruntime": onnxruntime.__version__,
+    }
 
 
 def _pose_of_result(result: FilterResult) -> PoseEstimate:

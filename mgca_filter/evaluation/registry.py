@@ -1,20 +1,23 @@
 """Rows of the scoreboard by name: the name says the settings, ``selection + … + estimator threshold``.
 
-Selections are ``NN`` (every nearest neighbour), ``mutual``, ``ratio 0.8`` and ``GMS``; estimators ``RANSAC``,
-``MAGSAC``, ``ACCURATE``, ``PROSAC`` (OpenCV), ``PoseLib`` and ``PoseLib progressive``, each with a threshold such as
-``0.75 px``. A number of iterations after it (``PROSAC 0.5 px 20000 iterations``) makes a time-matched row: raise it
-until the median time equals the filter's. The filter's own rows are listed in
-:data:`mgca_filter.evaluation.product.VARIANTS`; a selection before them stands for users who filter their matches
-beforehand.
+Selections are ``NN`` (every nearest neighbour), ``mutual``, ``ratio 0.8``, ``GMS`` and ``AdaLAM``; estimators
+``RANSAC``, ``LMEDS`` (no threshold), ``MAGSAC``, ``ACCURATE``, ``PROSAC`` (OpenCV), ``DEGENSAC`` (pydegensac),
+``PoseLib`` and ``PoseLib progressive``, each with a threshold such as ``0.75 px``. A number of iterations after it
+(``PROSAC 0.5 px 20000 iterations``) makes a time-matched row, which spends them all. ``network order`` in front of
+``PROSAC`` or ``PoseLib progressive`` sorts the matches by the network's scores instead of the ratio. The filter's own
+rows are listed in :data:`mgca_filter.evaluation.product.VARIANTS`; a selection before them stands for users who filter
+their matches beforehand.
 """
 
 from __future__ import annotations
 
 import re
 
-from .baselines import NEVER_CONFIDENT, Estimator, OpenCvEstimator, PoseLibEstimator, Rival
-from .methods import Method, Selection
-from .product import VARIANTS, ProductMethod
+from .baselines import Rival
+from .estimators import NEVER_CONFIDENT, DegensacEstimator, Estimator, OpenCvEstimator, PoseLibEstimator
+from .methods import Method
+from .product import NETWORK_ORDER, VARIANTS, NetworkOrderMethod, ProductMethod
+from .selection import Selection
 
 RANSAC_CONFIDENCE = 0.999
 RANSAC_MAX_ITERATIONS = 1000
@@ -24,6 +27,7 @@ DEFAULT_THRESHOLD_PX = {
     "MAGSAC": 0.5,
     "ACCURATE": 0.5,
     "PROSAC": 0.5,
+    "DEGENSAC": 0.5,
     "PoseLib": 0.75,
     "PoseLib progressive": 0.75,
 }
@@ -37,19 +41,34 @@ DEFAULT_THRESHOLD_PX = {
 RIVAL_ROWS = (
     "NN + RANSAC 3 px",
     "NN + MAGSAC 0.5 px",
+    "mutual + MAGSAC 0.5 px",
     "GMS + MAGSAC 0.5 px",
+    "AdaLAM + MAGSAC 0.5 px",
+    "AdaLAM + PROSAC 0.5 px",
     "ratio 0.8 + RANSAC 0.75 px",
+    "mutual + ratio 0.8 + LMEDS",
     "mutual + ratio 0.8 + MAGSAC 0.25 px",
+    "mutual + ratio 0.9 + ACCURATE 0.5 px",
+    "mutual + ratio 0.9 + DEGENSAC 0.5 px",
     "mutual + ratio 0.9 + PROSAC 0.5 px",
     "mutual + ratio 0.9 + PROSAC 0.75 px",
     "mutual + ratio 0.9 + PoseLib 0.75 px",
     "mutual + ratio 0.9 + PoseLib progressive 0.75 px",
 )
 
-PRODUCT_ROWS = tuple(VARIANTS)
+_FRONTS = ("NN", "mutual", "ratio 0.8", "mutual + ratio 0.8", "mutual + ratio 0.9")
+_ESTIMATORS = ("RANSAC 0.75 px", "MAGSAC 0.5 px", "PROSAC 0.5 px", "PoseLib 0.75 px", "PoseLib progressive 0.75 px")
+GRID_ROWS = tuple(f"{front} + {estimator}" for front in _FRONTS for estimator in _ESTIMATORS)
+"""Every test of the matches before every estimator, each estimator at one threshold."""
+
+PRODUCT_ROWS = (
+    *VARIANTS,
+    f"mutual + ratio 0.9 + {NETWORK_ORDER} + PROSAC 0.5 px",
+    f"mutual + ratio 0.9 + {NETWORK_ORDER} + PoseLib progressive 0.75 px",
+)
 
 _ESTIMATOR = re.compile(
-    r"(?P<kind>RANSAC|MAGSAC|ACCURATE|PROSAC|PoseLib progressive|PoseLib)"
+    r"(?P<kind>RANSAC|LMEDS|MAGSAC|ACCURATE|PROSAC|DEGENSAC|PoseLib progressive|PoseLib)"
     r"(?: (?P<px>\d*\.?\d+) px)?(?: (?P<iterations>[1-9]\d*) iterations)?"
 )
 
@@ -65,8 +84,9 @@ def parse_method(name: str, model: str | None = None) -> Method:
         ValueError: the name does not follow the grammar.
     """
     *tests, last = [part.strip() for part in name.split("+")]
-    selection = _parse_selection(tests, name)
-    if last in VARIANTS:
+    by_network = bool(tests) and tests[-1] == NETWORK_ORDER
+    selection = _parse_selection(tests[:-1] if by_network else tests, name)
+    if last in VARIANTS and not by_network:
         return ProductMethod(last, selection, model)
     match = _ESTIMATOR.fullmatch(last)
     if match is None or not tests:
@@ -74,34 +94,45 @@ def parse_method(name: str, model: str | None = None) -> Method:
             f"{name!r} is no method; expected selections and an estimator, such as "
             f"{RIVAL_ROWS[-1]!r}, or one of {', '.join(VARIANTS)}"
         )
-    kind = match["kind"]
-    threshold_px = float(match["px"] or DEFAULT_THRESHOLD_PX[kind])
-    if threshold_px == 0:
-        raise ValueError(f"{name!r}: the threshold must be positive")
-    iterations = None if match["iterations"] is None else int(match["iterations"])
-    return Rival(selection, _build_estimator(kind, threshold_px, iterations))
+    estimator = _build_estimator(match, name)
+    if not by_network:
+        return Rival(selection, estimator)
+    if not estimator.ordered:
+        raise ValueError(f"{name!r}: {estimator.name} has no use for an order; expected PROSAC or PoseLib progressive")
+    return NetworkOrderMethod(selection, estimator, model)
 
 
 def _parse_selection(tests: list[str], name: str) -> Selection:
-    mutual, max_ratio, gms = False, None, False
+    chosen: dict[str, float | bool] = {}
+    flags = {"mutual": "mutual", "GMS": "gms", "AdaLAM": "adalam"}
     for test in tests:
         ratio = re.fullmatch(r"ratio (0?\.\d+|1)", test)
         if ratio:
-            max_ratio = float(ratio[1])
-        elif test == "mutual":
-            mutual = True
-        elif test == "GMS":
-            gms = True
+            chosen["max_ratio"] = float(ratio[1])
+        elif test in flags:
+            chosen[flags[test]] = True
         elif test != "NN":
-            raise ValueError(f"{name!r}: {test!r} is no selection; expected NN, mutual, ratio 0.9 or GMS")
-    return Selection(mutual, max_ratio, gms)
+            raise ValueError(f"{name!r}: {test!r} is no selection; expected NN, mutual, ratio 0.9, GMS or AdaLAM")
+    return Selection(**chosen)  # type: ignore[arg-type]
 
 
-def _build_estimator(kind: str, threshold_px: float, iterations: int | None) -> Estimator:
-    if kind.startswith("PoseLib"):
-        return PoseLibEstimator(threshold_px, kind.endswith("progressive"), iterations)
+def _build_estimator(match: re.Match[str], name: str) -> Estimator:
+    kind = match["kind"]
+    iterations = None if match["iterations"] is None else int(match["iterations"])
+    if kind == "LMEDS":
+        if match["px"] is not None:
+            raise ValueError(f"{name!r}: LMEDS has no threshold, expected none")
+        threshold_px = None
+    else:
+        threshold_px = float(match["px"] or DEFAULT_THRESHOLD_PX[kind])
+        if threshold_px == 0:
+            raise ValueError(f"{name!r}: the threshold must be positive")
+        if kind.startswith("PoseLib"):
+            return PoseLibEstimator(threshold_px, kind.endswith("progressive"), iterations)
+        if kind == "DEGENSAC":
+            return DegensacEstimator(threshold_px, iterations)
     if iterations is not None:
         return OpenCvEstimator(kind, threshold_px, NEVER_CONFIDENT, iterations)
-    if kind == "RANSAC":
+    if kind in ("RANSAC", "LMEDS"):
         return OpenCvEstimator(kind, threshold_px, RANSAC_CONFIDENCE, RANSAC_MAX_ITERATIONS)
     return OpenCvEstimator(kind, threshold_px)

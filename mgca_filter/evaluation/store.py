@@ -22,7 +22,7 @@ class ResultKey:
     """What a stored result depends on; two runs share results where all of it is equal.
 
     ``settings`` are the method's own (:meth:`Method.settings`: options, library versions, model hash), ``data_sha256``
-    is the bundle file's.
+    is that of the pairs' source.
     """
 
     method: str
@@ -54,8 +54,7 @@ class ResultStore:
         if not path.exists():
             return {}
         try:
-            rows = json.loads(path.read_text())["outcomes"]
-            outcomes = [PairOutcome(**{**row, "kept": tuple(row["kept"]), "mask": tuple(row["mask"])}) for row in rows]
+            outcomes = [PairOutcome.from_json(row) for row in json.loads(path.read_text())["outcomes"]]
         except (ValueError, KeyError, TypeError) as error:
             logger.warning("%s: unreadable, computed again (%s)", path, error)
             return {}
