@@ -137,6 +137,7 @@ class MatchFilter:
         pair, metadata = job.pair, self._backend.metadata
         logits = assemble_logits(pair.attributes, pair.valid, job.sent, job.output, self._backend)
         scores = np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
+        model = None
         started = time.perf_counter()
         if self.method == "none":
             verdict = _verdict_by_scores(pair, scores)
@@ -161,7 +162,12 @@ class MatchFilter:
             t=verdict.t,
             status=verdict.status,
             num_inliers=int(np.count_nonzero(verdict.mask)),
-            info={**self._describe(job), "logits": logits, **verdict.info},
+            info={
+                **self._describe(job),
+                "logits": logits,
+                "fitted_essential": None if model is None else model.E,
+                **verdict.info,
+            },
         )
 
     def _describe(self, job: _Job) -> dict[str, Any]:

@@ -42,7 +42,8 @@ class FilterResult:
         num_inliers: number of True in ``mask``.
         info: ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``homography`` (3, 3)
-            where one explains the pair, and what else a step wants to tell.
+            where one explains the pair, ``fitted_essential`` (3, 3) or None as the robust fit left it, before the
+            verdict, and what else a step wants to tell.
     """
 
     mask: NDArray[np.bool_]

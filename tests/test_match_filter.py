@@ -62,6 +62,7 @@ def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:
     assert len(result.info["model_sha256"]) == 64
     assert result.info["intrinsics"] == "given"
     assert set(result.info["timings_ms"]) == {"prepare", "network", "fit", "verdict", "total"}
+    np.testing.assert_array_equal(result.info["fitted_essential"], result.E)
     np.testing.assert_allclose(np.linalg.svd(result.E, compute_uv=False), [0.5**0.5, 0.5**0.5, 0], atol=1e-9)
     pixels = np.hstack([scene.points1, scene.points2])
     np.testing.assert_array_equal(result.mask, sampson_distance(pixels, result.F) < 1.0)
@@ -169,6 +170,13 @@ def test_method_none_keeps_what_the_network_believes(scene: Scene, model_file: P
     assert result.R is None
     assert result.status is Status.OK
     assert result.info["network_essential"].shape == (3, 3)
+
+
+def test_what_the_verdict_rejects_can_still_be_seen(model_file: Path) -> None:
+    result = run(make_scene("rotation"), model_file)
+    assert result.E is None
+    assert result.info["fitted_essential"].shape == (3, 3)
+    assert run(make_scene(), model_file, method="none").info["fitted_essential"] is None
 
 
 def test_second_intrinsics_default_to_the_first(scene: Scene, model_file: Path) -> None:
