@@ -25,6 +25,8 @@ MIN_MATCHES = 8
 # A pose from the dominant plane is worth refining when it starts below this multiple of the cost to beat.
 RIVAL_COST_FACTOR = 1.5
 _POSELIB_MIN_ITERATIONS = 1000
+# Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
+_find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
 # recoverPose drops points farther than 50 baselines unless told otherwise.
 _ANY_DISTANCE = 1e9
 
@@ -188,9 +190,9 @@ def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibra
     limits = (options.confidence, options.max_iterations)
     try:
         if options.method == "ransac" and calibrated:
-            M, _ = cv2.findEssentialMat(x1, x2, np.eye(3), cv2.RANSAC, limits[0], threshold, limits[1])
+            M, _ = _find_essential_mat(x1, x2, np.eye(3), cv2.RANSAC, limits[0], threshold, limits[1])
         elif options.method == "ransac":
-            M, _ = cv2.findFundamentalMat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
+            M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
         else:
             prosac = options.method == "prosac"
             sampler = cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM
@@ -198,9 +200,9 @@ def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibra
             params = usac_params(sampler, score, threshold, *limits, options.seed)
             if calibrated:
                 # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
-                M, _ = cv2.findEssentialMat(x1, x2, np.eye(3), np.eye(3), None, None, params)
+                M, _ = _find_essential_mat(x1, x2, np.eye(3), np.eye(3), None, None, params)
             else:
-                M, _ = cv2.findFundamentalMat(x1, x2, params)
+                M, _ = _find_fundamental_mat(x1, x2, params)
     except cv2.error:
         return None
     return _best_of_stack(M, np.diag([unit, unit, 1.0]), rows, options.threshold_px / focal_px)
