@@ -9,6 +9,8 @@ from .correspondences import MatchAttributes
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
 from .image_matching import ImageMatchResult, match_images
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
+from .opencv_api import findEssentialMat, findFundamentalMat, matchMGCA
+from .opencv_patch import patch_cv2
 from .pair_input import MatchPair
 from .result import FilterResult, Status
 
@@ -28,6 +30,10 @@ __all__ = [
     "__version__",
     "filter_many",
     "filter_matches",
+    "findEssentialMat",
+    "findFundamentalMat",
+    "matchMGCA",
     "match_images",
     "model_path",
+    "patch_cv2",
 ]

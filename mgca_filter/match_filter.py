@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .backends import BACKENDS, Providers, shared_backend
 from .correspondences import MatchAttributes
-from .option_checks import check_choice, check_number, check_path, check_providers, check_seed
+from .option_checks import check_choice, check_integer, check_number, check_path, check_providers
 from .pair_input import MatchPair, PairInput, prepare_pair
 from .result import FilterResult, Status
 from .robust_fit import METHODS, MIN_MATCHES, RobustFitOptions, estimate_model, match_order
@@ -68,7 +68,9 @@ class MatchFilter:
         self.threshold = check_number(threshold, "threshold", 0.0, float("inf"))
         self.method = method
         self.fit_options = RobustFitOptions(
-            method=method, confidence=check_number(confidence, "confidence", 0.0, 1.0), seed=check_seed(seed)
+            method=method,
+            confidence=check_number(confidence, "confidence", 0.0, 1.0),
+            seed=check_integer(seed, "seed", 0),
         )
         self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
 

@@ -27,12 +27,12 @@ def check_number(value: Any, name: str, low: float, high: float) -> float:
     return float(value)
 
 
-def check_seed(value: Any) -> int:
-    """The integer of 0 or more."""
+def check_integer(value: Any, name: str, least: int) -> int:
+    """The integer of ``least`` or more."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise TypeError(f"seed: expected an integer, got {type(value).__name__}")
-    if value < 0:
-        raise ValueError(f"seed: expected 0 or more, got {value}")
+        raise TypeError(f"{name}: expected an integer, got {type(value).__name__}")
+    if value < least:
+        raise ValueError(f"{name}: expected {least} or more, got {value}")
     return int(value)
 
 

@@ -1,0 +1,338 @@
+"""OpenCV's twins: the names, orders, types and habits of the functions that they stand in for."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from conftest import SIZE, K, Scene, make_scene
+
+import mgca_filter
+from mgca_filter import Status, filter_matches, findEssentialMat, findFundamentalMat, matchMGCA, patch_cv2
+from mgca_filter.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.opencv_api import _ESSENTIAL_OVERLOADS, _FUNDAMENTAL_OVERLOADS
+
+TWINS = {"E": lambda p1, p2: findEssentialMat(p1, p2, K), "F": findFundamentalMat}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return make_scene(right=150, wrong=100)
+
+
+def forms(function: Callable[..., Any]) -> list[list[str]]:
+    """Parameter names of every overload, as OpenCV's own documentation lists them."""
+    lines = re.findall(rf"^{function.__name__}\((.*)\) ->", function.__doc__ or "", re.MULTILINE)
+    return [re.findall(r"\w+", line) for line in lines]
+
+
+@pytest.mark.parametrize(
+    ("original", "twins"),
+    [
+        (cv2.findEssentialMat, _ESSENTIAL_OVERLOADS),
+        (cv2.findFundamentalMat, _FUNDAMENTAL_OVERLOADS),
+        (cv2.xfeatures2d.matchGMS, [matchMGCA]),
+    ],
+)
+def test_every_overload_of_this_opencv_has_a_twin(original: Callable, twins: list[Callable]) -> None:
+    documented = forms(original)
+    assert documented
+    for names in documented:
+        assert names in [list(inspect.signature(twin).parameters) for twin in twins]
+
+
+def test_essential_matrix_is_what_opencv_users_expect(scene: Scene) -> None:
+    E, mask = findEssentialMat(scene.points1, scene.points2, K, cv2.RANSAC, 0.999, 1.0)
+    assert E.shape == (3, 3)
+    assert E.dtype == np.float64
+    assert mask.shape == (250, 1)
+    assert mask.dtype == np.uint8
+    assert set(np.unique(mask)) == {0, 1}
+    np.testing.assert_allclose(np.linalg.svd(E, compute_uv=False), [0.5**0.5, 0.5**0.5, 0], atol=1e-9)
+    assert np.mean(mask.ravel() == scene.inlier) > 0.9
+    _, R, t, _ = cv2.recoverPose(E, scene.points1, scene.points2, K, mask=mask)
+    assert pose_error_deg(R, t, scene.R, scene.t) < 1.0
+
+
+def test_fundamental_matrix_is_what_opencv_users_expect(scene: Scene) -> None:
+    F, mask = findFundamentalMat(scene.points1, scene.points2, cv2.FM_RANSAC, 1.0, 0.99)
+    assert F[2, 2] == pytest.approx(1.0)
+    assert np.linalg.matrix_rank(F, tol=1e-6 * np.linalg.norm(F)) == 2
+    assert mask.shape == (250, 1)
+    pixels = np.hstack([scene.points1, scene.points2])
+    np.testing.assert_array_equal(mask.ravel() == 1, sampson_distance(pixels, F) < 1.0)
+
+
+def test_overloads_of_one_camera_agree(scene: Scene) -> None:
+    points = (scene.points1, scene.points2)
+    expected, mask = findEssentialMat(*points, K)
+    params = cv2.UsacParams()
+    params.confidence, params.threshold, params.maxIterations = 0.999, 1.0, 1000
+    for arguments, options in (
+        ((K, cv2.RANSAC, 0.999, 1.0, 1000), {}),
+        ((), {"cameraMatrix": K, "method": cv2.USAC_ACCURATE}),
+        ((800.0, (319.5, 239.5)), {}),
+        ((), {"focal": 800.0, "pp": (319.5, 239.5), "prob": 0.999}),
+        ((K, None, K, None), {}),
+        ((K, np.zeros(5), K, np.zeros((1, 5)), cv2.RANSAC, 0.999, 1.0), {}),
+        ((K, np.array([]), K, np.array([])), {"threshold": 1.0}),
+        ((K, K, None, None, params), {}),
+    ):
+        E, again = findEssentialMat(*points, *arguments, **options)
+        np.testing.assert_array_equal(E, expected)
+        np.testing.assert_array_equal(again, mask)
+
+
+def test_overloads_of_the_fundamental_matrix_agree(scene: Scene) -> None:
+    points = (scene.points1, scene.points2)
+    expected, mask = findFundamentalMat(*points)
+    params = cv2.UsacParams()
+    params.confidence, params.threshold, params.maxIterations = 0.99, 3.0, 1000
+    for arguments in ((cv2.FM_RANSAC, 3.0, 0.99), (cv2.FM_LMEDS, 3.0, 0.99, 1000), (params,), (cv2.RANSAC, -1.0, 7.0)):
+        F, again = findFundamentalMat(*points, *arguments)
+        np.testing.assert_array_equal(F, expected)
+        np.testing.assert_array_equal(again, mask)
+
+
+@pytest.mark.parametrize("layout", [np.float32, "N1", "1N", list, int], ids=str)
+def test_layouts_of_the_points(scene: Scene, layout: Any) -> None:
+    convert = {
+        "N1": lambda p: p[:, None],
+        "1N": lambda p: p[None],
+        list: lambda p: p.tolist(),
+        np.float32: np.float32,
+        int: lambda p: np.round(p).astype(int),
+    }[layout]
+    E, mask = findEssentialMat(convert(scene.points1), convert(scene.points2), K, threshold=2.0)
+    assert mask.shape == (250, 1)
+    _, R, t, _ = cv2.recoverPose(E, scene.points1, scene.points2, K, mask=mask)
+    assert pose_error_deg(R, t, scene.R, scene.t) < 3.0
+
+
+def test_two_cameras_and_their_distortion(scene: Scene) -> None:
+    bend = np.array([-0.2, 0.05, 0.001, -0.001, 0.0])
+    K2 = np.array([[950.0, 0, 300.0], [0, 950.0, 260.0], [0, 0, 1]])
+    rays = [np.column_stack([(p - K[:2, 2]) / K[0, 0], np.ones(250)]) for p in (scene.points1, scene.points2)]
+    zero = np.zeros(3)
+    points1 = cv2.projectPoints(rays[0], zero, zero, K, bend)[0]
+    points2 = cv2.projectPoints(rays[1], zero, zero, K2, None)[0]
+    E, mask = findEssentialMat(points1, points2, K, bend, K2, None)
+    _, E2, R, t, mask2 = cv2.recoverPose(points1, points2, K, bend, K2, None)
+    assert mask.sum() > 120
+    params = cv2.UsacParams()
+    again, _ = findEssentialMat(points1, points2, K, K2, bend, None, params)
+    for found in (E, again):
+        normalised = [cv2.undistortPoints(points1, K, bend), cv2.undistortPoints(points2, K2, None)]
+        _, R, t, _ = cv2.recoverPose(found, normalised[0], normalised[1], np.eye(3), mask=mask.copy())
+        assert pose_error_deg(R, t, scene.R, scene.t) < 1.0
+
+
+def test_normalised_points_give_what_pixels_give(scene: Scene) -> None:
+    x1, x2 = ((p - K[:2, 2]) / K[0, 0] for p in (scene.points1, scene.points2))
+    pixels_E, pixels_mask = findEssentialMat(scene.points1, scene.points2, K, threshold=0.8)
+    for E, mask in (
+        findEssentialMat(x1, x2, np.eye(3), threshold=1e-3),
+        findEssentialMat(x1, x2, threshold=1e-3),
+    ):
+        _, R, t, _ = cv2.recoverPose(E, x1, x2, np.eye(3), mask=mask.copy())
+        assert pose_error_deg(R, t, scene.R, scene.t) < 1.0
+        assert np.mean(mask == pixels_mask) > 0.97
+    F, mask = findFundamentalMat(x1, x2, cv2.FM_RANSAC, 1e-3, 0.99)
+    assert np.mean(mask.ravel() == scene.inlier) > 0.85
+    assert np.median(sampson_distance(np.hstack([x1, x2]), F)[scene.inlier]) < 1e-3
+
+
+@pytest.fixture(scope="module")
+def hard() -> Scene:
+    return make_scene(right=60, wrong=140, noise_px=0.8)
+
+
+@pytest.mark.parametrize("options", [{"method": cv2.USAC_MAGSAC}, {"prob": 0.01}, {"maxIters": 1}], ids=str)
+def test_every_argument_of_the_fit_counts(hard: Scene, options: dict) -> None:
+    E, _ = findEssentialMat(hard.points1, hard.points2, K)
+    other, _ = findEssentialMat(hard.points1, hard.points2, K, **options)
+    assert other is None or not np.array_equal(E, other)
+
+
+def test_parameters_of_usac_count(hard: Scene) -> None:
+    def answer(**changes: Any) -> np.ndarray:
+        params = cv2.UsacParams()
+        for name, value in changes.items():
+            setattr(params, name, value)
+        return findFundamentalMat(hard.points1, hard.points2, params)
+
+    F, mask = answer()
+    assert not np.array_equal(answer(randomGeneratorState=3)[0], F)
+    assert not np.array_equal(answer(score=cv2.SCORE_METHOD_MAGSAC)[0], F)
+    assert answer(threshold=20.0)[1].sum() > mask.sum()
+
+
+def test_threshold_moves_the_mask_only(scene: Scene) -> None:
+    (E, tight), (again, loose) = (findEssentialMat(scene.points1, scene.points2, K, threshold=t) for t in (0.2, 4.0))
+    np.testing.assert_array_equal(E, again)
+    assert tight.sum() < loose.sum()
+
+
+def test_a_mask_passed_in_is_written_to(scene: Scene) -> None:
+    buffer = np.full((250, 1), 7, dtype=np.uint8)
+    _, mask = findEssentialMat(scene.points1, scene.points2, K, mask=buffer)
+    assert mask is buffer
+    np.testing.assert_array_equal(mask, findEssentialMat(scene.points1, scene.points2, K)[1])
+    _, other = findFundamentalMat(scene.points1, scene.points2, mask=np.zeros(3, np.uint8))
+    assert other.shape == (250, 1)
+
+
+def test_solvers_are_opencvs_own(scene: Scene) -> None:
+    right = scene.inlier
+    for method, rows in ((cv2.FM_8POINT, np.flatnonzero(right)), (cv2.FM_7POINT, np.flatnonzero(right)[:7])):
+        points = (scene.points1[rows], scene.points2[rows])
+        F, mask = findFundamentalMat(*points, method)
+        expected, _ = cv2.findFundamentalMat(*points, method)
+        np.testing.assert_array_equal(F, expected)
+        assert mask.shape == (len(rows), 1)
+    assert findFundamentalMat(np.zeros((3, 2)), np.zeros((3, 2)), cv2.FM_8POINT)[0] is None
+
+
+def test_rotation_has_no_essential_matrix_but_a_mask() -> None:
+    turned = make_scene("rotation")
+    E, mask = findEssentialMat(turned.points1, turned.points2, K)
+    assert E is None
+    assert mask[turned.inlier].mean() > 0.8
+
+
+@pytest.mark.parametrize("arguments", [("K",), (K, "ransac"), (K, None, K), (K, 8, 0.999, 1.0, 1000, None, 1)])
+def test_arguments_that_fit_no_overload(scene: Scene, arguments: tuple) -> None:
+    with pytest.raises(TypeError, match="findEssentialMat"):
+        findEssentialMat(scene.points1, scene.points2, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"prob": 1.0}, "prob"),
+        ({"threshold": 0.0}, "threshold"),
+        ({"maxIters": 0}, "maxIters"),
+        ({"points2": np.zeros((3, 2))}, "points2"),
+        ({"points1": np.zeros((250, 3))}, "points1"),
+        ({"cameraMatrix": np.zeros((2, 2))}, "K1"),
+    ],
+)
+def test_misuse_names_the_argument(scene: Scene, options: dict, word: str) -> None:
+    arguments = {"points1": scene.points1, "points2": scene.points2, "cameraMatrix": K, **options}
+    with pytest.raises(ValueError, match=word):
+        findEssentialMat(**arguments)
+
+
+@pytest.mark.parametrize("twin", TWINS.values(), ids=TWINS)
+@pytest.mark.parametrize(
+    "points",
+    [
+        *(np.random.default_rng(0).uniform(0, 400, (n, 2)) for n in range(8)),
+        np.full((60, 2), 5.0),
+        np.full((60, 2), np.nan),
+        np.column_stack([np.arange(60.0), 2 * np.arange(60.0)]),
+        np.where(np.arange(120).reshape(60, 2) % 7 == 0, np.inf, np.random.default_rng(1).uniform(0, 400, (60, 2))),
+        np.random.default_rng(1).uniform(0, 1e300, (60, 2)),
+    ],
+    ids=[*map(str, range(8)), "equal", "nan", "line", "inf", "huge"],
+)
+def test_data_never_raises(twin: Callable, points: np.ndarray) -> None:
+    other = points[::-1].copy()
+    for second in (points, other):
+        M, mask = twin(points, second)
+        assert M is None or M.shape == (3, 3)
+        assert mask.shape == (len(points), 1)
+        assert mask.dtype == np.uint8
+
+
+def test_only_outliers_keep_nothing() -> None:
+    points = np.random.default_rng(0).uniform(0, 600, (2, 300, 2))
+    for twin in TWINS.values():
+        M, mask = twin(points[0], points[1])
+        assert M is None
+        assert not mask.any()
+
+
+def test_match_mgca_returns_the_kept_matches(scene: Scene) -> None:
+    kp1, kp2 = scene.keypoints()
+    knn = scene.knn_matches()
+    flat = [row[0] for row in knn]
+    kept = matchMGCA(SIZE, SIZE, kp1, kp2, flat)
+    assert isinstance(kept, tuple)
+    expected = filter_matches(kp1, kp2, flat, size1=SIZE, size2=SIZE).matches
+    assert [m.queryIdx for m in kept] == [m.queryIdx for m in expected]
+    assert np.mean(scene.inlier[[m.queryIdx for m in kept]]) > 0.9
+    assert matchMGCA(SIZE, SIZE, kp1, kp2, flat, withRotation=True, withScale=True, thresholdFactor=2.0) == kept
+    assert all(isinstance(m, cv2.DMatch) for m in matchMGCA(SIZE, SIZE, kp1, kp2, knn))
+    assert matchMGCA(SIZE, SIZE, kp1, kp2, []) == ()
+
+
+def originals() -> tuple[Callable, ...]:
+    return cv2.findEssentialMat, cv2.findFundamentalMat, cv2.xfeatures2d.matchGMS
+
+
+OPENCV = originals()
+
+
+@pytest.fixture(autouse=True)
+def _opencv_is_itself_again() -> Iterator[None]:
+    yield
+    assert originals() == OPENCV
+
+
+def test_patch_swaps_and_restores(scene: Scene) -> None:
+    with patch_cv2():
+        assert originals() == (findEssentialMat, findFundamentalMat, matchMGCA)
+        E, _ = cv2.findEssentialMat(scene.points1, scene.points2, K)
+    np.testing.assert_array_equal(E, findEssentialMat(scene.points1, scene.points2, K)[0])
+    assert originals() == OPENCV
+
+
+def test_patch_restores_after_an_exception_and_when_nested() -> None:
+    with pytest.raises(cv2.error), patch_cv2(), patch_cv2():
+        cv2.findHomography(np.zeros((2, 2)), np.zeros((2, 2)))
+    assert originals() == OPENCV
+    with patch_cv2():
+        with patch_cv2():
+            pass
+        assert originals() != OPENCV
+
+
+def test_patch_overlapping_in_threads_ends_with_the_last() -> None:
+    first, second = ExitStack(), ExitStack()
+    barrier = threading.Barrier(2, timeout=30)
+
+    def hold() -> None:
+        with second:
+            second.enter_context(patch_cv2())
+            barrier.wait()
+            barrier.wait()
+
+    thread = threading.Thread(target=hold)
+    first.enter_context(patch_cv2())
+    thread.start()
+    barrier.wait()
+    first.close()
+    assert originals() != OPENCV
+    barrier.wait()
+    thread.join()
+    assert originals() == OPENCV
+
+
+def test_the_filter_itself_is_the_same_under_the_patch(scene: Scene) -> None:
+    plain = filter_matches(scene.points1, scene.points2, None, K1=K)
+    with patch_cv2():
+        patched = filter_matches(scene.points1, scene.points2, None, K1=K)
+    assert plain.status is patched.status is Status.OK
+    np.testing.assert_array_equal(plain.E, patched.E)
+
+
+def test_public_names() -> None:
+    assert {"findEssentialMat", "findFundamentalMat", "matchMGCA", "patch_cv2"} <= set(mgca_filter.__all__)
