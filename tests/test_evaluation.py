@@ -26,9 +26,10 @@ from mgca_filter.evaluation.pairs import draw_indices, iterate_pairs, select_pai
 from mgca_filter.evaluation.predict import evaluate_pair, predict
 from mgca_filter.evaluation.product import pose_by_paper_protocol, pose_without_ransac
 from mgca_filter.evaluation.registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
-from mgca_filter.evaluation.report import format_report, summarize
+from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.store import ResultStore
+from mgca_filter.evaluation.summary import summarize
 from mgca_filter.scene_bundle import ScenePair
 
 PROSAC = "mutual + ratio 0.9 + PROSAC 0.5 px"
@@ -454,12 +455,13 @@ def test_reference_of_the_differences_can_be_chosen():
         summarize(small_results(), {}, replicates=10, reference="somebody")
 
 
-@pytest.mark.parametrize("markdown", [True, False])
-def test_tables_show_every_row_and_how_it_was_measured(markdown):
-    text = format_report(summarize(small_results(), {"commit": "abc", "seed": 0}, replicates=10), markdown=markdown)
-    for expected in ("mAP@20 by scene", "product − (rival)", "no model (1)", "one OpenCV thread", "commit: abc"):
+@pytest.mark.parametrize(("style", "row"), [("text", "product "), ("markdown", "| product"), ("latex", "product &")])
+def test_tables_show_every_row_and_how_it_was_measured(style, row):
+    text = format_report(summarize(small_results(), {"commit": "abc", "seed": 0}, replicates=10), style)
+    for expected in ("mAP@20 by scene", "(rival)", "the final mask", "bootstrap intervals", row):
         assert expected in text
-    assert ("| product" in text) is markdown
+    told = ("no model (1)", "one OpenCV thread", "commit: abc")
+    assert [words in text for words in told] == [style != "latex"] * 3
 
 
 def test_command_writes_tables_and_figures(folder, tmp_path, model_file, capsys):

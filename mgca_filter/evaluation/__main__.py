@@ -7,16 +7,23 @@ import json
 import logging
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ..errors import MgcaFilterError
 from .environment import library_versions, machine_description, source_commit
-from .pairs import select_pairs
+from .figures import draw_figures, is_ours
+from .methods import Method
+from .pairs import SceneSelection, sample_pairs, select_pairs
 from .predict import predict
-from .registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
-from .report import format_report, summarize
+from .qualitative import draw_pairs
+from .registry import GRID_ROWS, PRODUCT_ROWS, RIVAL_ROWS, TIME_MATCHED_ROWS, parse_method
+from .report import format_report
 from .sources import FORMATS
 from .store import ResultStore
+from .summary import ALL_SCENES, choose_reference, summarize
+from .time_matching import SAMPLE_PAIRS, TimeMatch, match_times
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +51,12 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         metavar="NAME",
         help="rows such as 'mutual + ratio 0.9 + PROSAC 0.5 px' or 'product'; 'rivals' and 'product-rows' stand for "
-        "the default rows of either kind",
+        "the default rows of either kind, 'grid' for every test of the matches before every estimator",
+    )
+    parser.add_argument(
+        "--time-matched",
+        metavar="NAME",
+        help="also run robust estimators with the milliseconds that this row of ours takes, such as 'product'",
     )
     parser.add_argument("--model", metavar="FILE", help="model of the product rows (default: the one in the package)")
     parser.add_argument(
@@ -61,6 +73,16 @@ def build_parser() -> argparse.ArgumentParser:
         "--json", metavar="FILE", help="write the figures here ('-' = standard output, tables left out)"
     )
     parser.add_argument("--markdown", metavar="FILE", help="write the tables here as Markdown")
+    parser.add_argument("--latex", metavar="FILE", help="write the tables here as LaTeX (booktabs)")
+    parser.add_argument("--figures", metavar="DIR", help="write curves here as SVG, and pairs where there are images")
+    parser.add_argument(
+        "--pictures",
+        type=_positive,
+        default=2,
+        metavar="N",
+        help="pairs of each scene among the figures (default 2): reference and best rival, right matches green, wrong "
+        "ones red",
+    )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress on standard error")
     return parser
 
@@ -73,37 +95,27 @@ def _positive(text: str) -> int:
 
 
 def _expand(names: Sequence[str] | None) -> list[str]:
-    groups = {"rivals": RIVAL_ROWS, "product-rows": PRODUCT_ROWS}
-    chosen = [row for name in names or groups for row in groups.get(name, (name,))]
+    groups = {"rivals": RIVAL_ROWS, "product-rows": PRODUCT_ROWS, "grid": GRID_ROWS}
+    chosen = [row for name in names or ("rivals", "product-rows") for row in groups.get(name, (name,))]
     return list(dict.fromkeys(chosen))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 = done, 2 = a bundle, model, package or argument that cannot be used."""
+    """Run the command; 0 = done, 2 = data, a model, a package or an argument that cannot be used."""
     options = build_parser().parse_args(arguments)
     logging.basicConfig(
         level=logging.WARNING if options.quiet else logging.INFO, format="%(message)s", stream=sys.stderr
     )
     try:
-        summary = run(options)
+        run(options)
     except (MgcaFilterError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    if options.json == "-":
-        json.dump(summary, sys.stdout, indent=1)
-        print()
-    else:
-        print(format_report(summary, markdown=False))
-    if options.json not in (None, "-"):
-        Path(options.json).write_text(json.dumps(summary, indent=1) + "\n")
-    if options.markdown:
-        Path(options.markdown).write_text(format_report(summary, markdown=True))
     return 0
 
 
-def run(options: argparse.Namespace) -> dict[str, object]:
-    """Draw the pairs, run the methods, and sum up."""
-    methods = [parse_method(name, options.model) for name in _expand(options.methods)]
+def run(options: argparse.Namespace) -> None:
+    """Draw the pairs, run the methods, sum up, and write what was asked for."""
     selections = select_pairs(
         options.path,
         options.scenes,
@@ -113,15 +125,49 @@ def run(options: argparse.Namespace) -> dict[str, object]:
         images=options.images,
     )
     store = ResultStore(options.store)
+    methods, not_installed = _installed([parse_method(name, options.model) for name in _expand(options.methods)])
+    time_matched: list[TimeMatch] = []
+    if options.time_matched is not None:
+        like = parse_method(options.time_matched, options.model)
+        sample = sample_pairs(selections, SAMPLE_PAIRS)
+        time_matched = match_times(TIME_MATCHED_ROWS, like, sample, store.folder)
+        methods += [parse_method(match.method) for match in time_matched]
     results = predict(
-        methods,
-        selections,
-        seeds=options.seeds,
-        workers=options.workers,
-        store=store,
-        progress=not options.quiet,
+        methods, selections, seeds=options.seeds, workers=options.workers, store=store, progress=not options.quiet
     )
-    context = {
+    context = {**_context(options, selections, methods), "not_installed": not_installed}
+    context["time_matched"] = [asdict(match) for match in time_matched]
+    summary = summarize(results, context, reference=options.reference, replicates=options.bootstrap, seed=options.seed)
+    _write(options, summary)
+    if options.figures:
+        draw_figures(summary, options.figures)
+        draw_pairs(_pictured(summary, methods, options.reference), selections, options.figures, options.pictures)
+
+
+def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[dict[str, str]]]:
+    """The methods that can run, and the others with the reason.
+
+    Raises:
+        ImportError: none can.
+    """
+    usable, lacking = [], []
+    for method in methods:
+        try:
+            method.settings()
+        except ImportError as error:
+            lacking.append({"method": method.name, "reason": str(error)})
+        else:
+            usable.append(method)
+    if not usable:
+        raise ImportError("; ".join(f"{item['method']}: {item['reason']}" for item in lacking))
+    return usable, lacking
+
+
+def _context(
+    options: argparse.Namespace, selections: Sequence[SceneSelection], methods: Sequence[Method]
+) -> dict[str, Any]:
+    """What the figures depend on besides the methods' answers."""
+    return {
         "seed": options.seed,
         "versions": library_versions(),
         "commit": source_commit(),
@@ -135,7 +181,29 @@ def run(options: argparse.Namespace) -> dict[str, object]:
             "methods": {method.name: method.settings() for method in methods},
         },
     }
-    return summarize(results, context, reference=options.reference, replicates=options.bootstrap, seed=options.seed)
+
+
+def _write(options: argparse.Namespace, summary: dict[str, Any]) -> None:
+    if options.json == "-":
+        json.dump(summary, sys.stdout, indent=1)
+        print()
+    else:
+        print(format_report(summary, "text"))
+    if options.json not in (None, "-"):
+        Path(options.json).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    if options.markdown:
+        Path(options.markdown).write_text(format_report(summary, "markdown"), encoding="utf-8")
+    if options.latex:
+        Path(options.latex).write_text(format_report(summary, "latex"), encoding="utf-8")
+
+
+def _pictured(summary: dict[str, Any], methods: Sequence[Method], reference: str | None) -> list[Method]:
+    """The best row beside the reference, and the reference."""
+    chosen = choose_reference([method.name for method in methods], reference)
+    others = [row for row in summary["rows"] if row["scene"] == ALL_SCENES and row["method"] != chosen]
+    rivals = [row for row in others if not is_ours(row["method"])] or others
+    names = [row["method"] for row in sorted(rivals, key=lambda row: -float(row["mAP@20"]))[:1]] + [chosen]
+    return [method for name in names for method in methods if method.name == name]
 
 
 if __name__ == "__main__":

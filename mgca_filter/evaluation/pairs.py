@@ -90,3 +90,24 @@ def iterate_pairs(selections: Sequence[SceneSelection]) -> Iterator[ScenePair]:
     for selection in selections:
         for index in selection.indices:
             yield selection.source[index]
+
+
+def sample_pairs(selections: Sequence[SceneSelection], count: int) -> list[ScenePair]:
+    """At most ``count`` pairs, as evenly from the scenes as they last; those that cannot be read are passed over.
+
+    Raises:
+        DatasetError: not one can be read.
+    """
+    pairs: list[ScenePair] = []
+    problems: list[DatasetError] = []
+    for selection in selections:
+        share = max(1, count // len(selections))
+        places = np.unique(np.linspace(0, len(selection) - 1, min(share, len(selection))).round().astype(int))
+        for place in places:
+            try:
+                pairs.append(selection.source[selection.indices[place]])
+            except DatasetError as error:
+                problems.append(error)
+    if not pairs:
+        raise DatasetError(f"not one pair can be read; the first of them: {problems[0]}")
+    return pairs[:count]

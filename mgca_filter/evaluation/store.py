@@ -40,17 +40,17 @@ class ResultKey:
 
 
 class ResultStore:
-    """Outcomes by key; with ``folder=None`` they live in memory only."""
+    """Outcomes by key; with ``folder=None`` they live in memory only, and are gone with the object."""
 
     def __init__(self, folder: str | Path | None) -> None:
-        self._folder = None if folder is None else Path(folder)
+        self.folder = None if folder is None else Path(folder)
         self._memory: dict[str, dict[int, PairOutcome]] = {}
 
     def load(self, key: ResultKey) -> dict[int, PairOutcome]:
         """Outcomes by index of the pair, as far as they are known."""
-        if self._folder is None:
+        if self.folder is None:
             return dict(self._memory.get(key.file_name, {}))
-        path = self._folder / key.file_name
+        path = self.folder / key.file_name
         if not path.exists():
             return {}
         try:
@@ -64,10 +64,10 @@ class ResultStore:
         """Merge outcomes into what is known. The file is replaced at once, never left half written."""
         known = self.load(key)
         known.update({outcome.pair: outcome for outcome in outcomes})
-        if self._folder is None:
+        if self.folder is None:
             self._memory[key.file_name] = known
             return
-        path = self._folder / key.file_name
+        path = self.folder / key.file_name
         path.parent.mkdir(parents=True, exist_ok=True)
         content = {"key": asdict(key), "outcomes": [asdict(known[pair]) for pair in sorted(known)]}
         temporary = path.with_suffix(f".{os.getpid()}.tmp")

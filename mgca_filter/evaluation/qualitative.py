@@ -1,0 +1,54 @@
+"""Pictures of what methods keep: right matches green, wrong ones red, one strip for each method."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from ..drawing import MatchPanel, draw_matches
+from ..epipolar import symmetric_epipolar_distance_squared
+from ..errors import DatasetError
+from ..scene_bundle import ScenePair
+from .methods import Method
+from .metrics import TRUE_INLIER_DISTANCE_SQUARED
+from .pairs import SceneSelection
+from .predict import evaluate_pair
+from .sources.base import Image
+
+
+def draw_pairs(
+    methods: Sequence[Method], selections: Sequence[SceneSelection], folder: str | Path, per_scene: int
+) -> list[Path]:
+    """Write ``SCENE_INDEX.jpg`` for ``per_scene`` pairs of each scene that has images; returns the files.
+
+    Pairs lie evenly over a scene's selection. Drawn are the matches of each method's final mask.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for selection in selections:
+        places = np.unique(np.linspace(0, len(selection) - 1, per_scene + 2)[1:-1].round().astype(int))
+        for index in (selection.indices[place] for place in places):
+            try:
+                pair = selection.source[index]
+                images = selection.source.images(pair)
+            except DatasetError:
+                continue  # listed with the figures
+            if images is None:
+                continue
+            files.append(folder / f"{pair.scene}_{index}.jpg")
+            cv2.imwrite(str(files[-1]), np.vstack([_strip(method, pair, images) for method in methods]))
+    return files
+
+
+def _strip(method: Method, pair: ScenePair, images: tuple[Image, Image]) -> Image:
+    mask = method.run(pair, 0).mask
+    error_deg = evaluate_pair(method, pair, 0).error_deg
+    distance = symmetric_epipolar_distance_squared(pair.correspondences, pair.E)
+    right = distance[mask] < TRUE_INLIER_DISTANCE_SQUARED
+    facts = [f"{np.count_nonzero(right)} right", f"{np.count_nonzero(~right)} wrong", f"pose error {error_deg:.1f} deg"]
+    panel = MatchPanel(right, method.name, facts, success=error_deg < 5.0)
+    return draw_matches(*images, pair.points1[mask], pair.points2[mask], panel)

@@ -1,0 +1,219 @@
+"""Outcomes to figures: one summary, ready for JSON, from which tables and pictures are made."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .curves import precision_recall_curves, recall_curves, reliability_tables
+from .methods import UNREADABLE, PairOutcome
+from .metrics import (
+    FAILURE_DEG,
+    POSE_STATISTICS,
+    FloatArray,
+    SceneErrors,
+    bootstrap_interval,
+    mean_of_the_nonzero,
+    mean_over_pairs,
+    mean_over_scenes,
+    median_error,
+    paired_bootstrap_interval,
+)
+from .predict import SceneOutcomes
+
+ALL_SCENES, ALL_PAIRS = "all", "pairs"
+INTERVAL_STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
+COUNTS = ("failures", "unreadable", "paper_dropped")
+"""Numbers of pairs, which the mean over scenes adds up; ``pairs`` itself among them."""
+
+NOTES = (
+    "mAP, AUC, P, R and F in per cent, errors in degrees; a pair without a pose counts as 180 degrees.",
+    "P, R, F: the decision before the robust fit (rivals: their selection; the filter: logit > 0) over all matches "
+    "against the label 1e-4; mask_P, mask_R, mask_F: the final inliers. Every pair counts.",
+    "paper_P, paper_R, paper_F: as published evaluations of the family have them, logit > 2 and pairs whose value is "
+    "0 or NaN left out of the mean. Not to be compared with the figures beside them.",
+    "Times: wall clock of filter and estimator with one OpenCV thread; ONNX Runtime uses its own number of threads.",
+    "OpenCV's estimators and the filter's OpenCV fit are deterministic and run once; PoseLib and DEGENSAC are averaged "
+    "over seeds.",
+    "PROSAC and PoseLib with progressive sampling get their matches sorted: by ratio, or by the network's scores.",
+)
+
+
+def scene_errors(outcomes: SceneOutcomes) -> dict[str, FloatArray]:
+    """Pose errors (seeds, pairs) by scene, degrees."""
+    return {
+        scene: np.array([[outcome.error_deg for outcome in run] for run in runs]) for scene, runs in outcomes.items()
+    }
+
+
+def summarize(
+    results: Mapping[str, SceneOutcomes],
+    context: Mapping[str, Any],
+    *,
+    reference: str | None = None,
+    replicates: int = 1000,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Everything a report shows, ready for JSON.
+
+    Args:
+        results: outcomes by method, as :func:`predict.predict` returns them.
+        context: written beside the rows as it is: versions, seed, commit, machine, settings.
+        reference: method whose differences from every other are listed; None = the first product row, else the last.
+        replicates: of the bootstrap; 0 leaves the intervals and differences out.
+        seed: of the bootstrap.
+
+    Returns:
+        ``rows`` (one per method and scene, then scene "all" = mean over scenes and "pairs" = mean over pairs),
+        ``differences``, ``failures`` (reasons by method), ``unreadable`` (pairs that no method could have solved),
+        ``curves``, ``timing`` and ``notes``, and the context's own fields.
+    """
+    errors = {name: scene_errors(outcomes) for name, outcomes in results.items()}
+    rows = [row for name, outcomes in results.items() for row in _method_rows(name, outcomes, errors[name])]
+    differences: list[dict[str, Any]] = []
+    if replicates > 0:
+        for row in rows:
+            if row["scene"] == ALL_SCENES:
+                row["intervals"] = _intervals(errors[row["method"]], replicates, seed)
+        differences = _differences(errors, choose_reference(list(results), reference), replicates, seed)
+    return {
+        "rows": rows,
+        "differences": differences,
+        "failures": {name: _failures(outcomes) for name, outcomes in results.items()},
+        "unreadable": _unreadable(results),
+        "curves": {
+            "recall": recall_curves(errors),
+            "precision_recall": precision_recall_curves(results),
+            "reliability": reliability_tables(results),
+        },
+        "timing": _timing(results),
+        "notes": list(NOTES),
+        **context,
+    }
+
+
+def _method_rows(name: str, outcomes: SceneOutcomes, errors: SceneErrors) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = []
+    for scene, runs in outcomes.items():
+        figures = {key: 100.0 * statistic(errors[scene]) for key, statistic in POSE_STATISTICS.items()}
+        figures["median_error_deg"] = median_error(errors[scene])
+        rows.append(
+            {"method": name, "scene": scene, "pairs": len(runs[0]), **figures, **_decisions(runs), **_times(runs)}
+        )
+    pairs = sum(row["pairs"] for row in rows)
+    numbers = [key for key in rows[0] if key not in ("method", "scene", "pairs", *COUNTS)]
+    mean = {key: float(np.mean([row[key] for row in rows])) for key in numbers}
+    sums = {key: sum(row[key] for row in rows) for key in COUNTS if key in rows[0]}
+    headline = {"method": name, "scene": ALL_SCENES, "pairs": pairs, **mean, **sums}
+    pooled_runs = [[outcome for runs in outcomes.values() for outcome in runs[s]] for s in range(_seeds(outcomes))]
+    pooled = {key: 100.0 * mean_over_pairs(statistic, errors) for key, statistic in POSE_STATISTICS.items()}
+    pooled["median_error_deg"] = mean_over_pairs(median_error, errors)
+    pooled_row = {
+        "method": name,
+        "scene": ALL_PAIRS,
+        "pairs": pairs,
+        **pooled,
+        **_decisions(pooled_runs),
+        **_times(pooled_runs),
+    }
+    return [*rows, headline, pooled_row]
+
+
+def _seeds(outcomes: SceneOutcomes) -> int:
+    return len(next(iter(outcomes.values())))
+
+
+def _decisions(runs: list[list[PairOutcome]]) -> dict[str, float]:
+    """Means of P, R and F over pairs and seeds, medians of both parts of the error, numbers of pairs per seed."""
+    outcomes = [outcome for run in runs for outcome in run]
+    kept = 100.0 * np.mean([outcome.kept for outcome in outcomes], axis=0)
+    mask = 100.0 * np.mean([outcome.mask for outcome in outcomes], axis=0)
+    figures = dict(zip(("P", "R", "F", "mask_P", "mask_R", "mask_F"), (float(v) for v in (*kept, *mask))))
+    for part in ("rotation_deg", "translation_deg"):
+        values = [FAILURE_DEG if getattr(o, part) is None else getattr(o, part) for o in outcomes]
+        figures[f"median_{part}"] = float(np.median(values))
+    paper = [outcome.paper for outcome in outcomes if not outcome.unreadable]
+    if paper and all(values is not None for values in paper):
+        for key, values in zip(("paper_P", "paper_R", "paper_F"), zip(*paper)):
+            mean, dropped = mean_of_the_nonzero(values)
+            figures |= {key: 100.0 * mean, "paper_dropped": dropped / len(runs)}
+    figures["failures"] = sum(bool(outcome.failure) for outcome in outcomes) / len(runs)
+    figures["unreadable"] = sum(outcome.unreadable for outcome in outcomes) / len(runs)
+    return figures
+
+
+def _times(runs: list[list[PairOutcome]]) -> dict[str, float]:
+    """Medians and 95th percentile of the times of all pairs that could be read; 0 without any."""
+    timed = [outcome for run in runs for outcome in run if not outcome.unreadable]
+    wall, cpu = ([getattr(outcome, field) for outcome in timed] or [0.0] for field in ("elapsed_ms", "cpu_ms"))
+    return {
+        "median_ms": float(np.median(wall)),
+        "p95_ms": float(np.percentile(wall, 95)),
+        "median_cpu_ms": float(np.median(cpu)),
+    }
+
+
+def _intervals(errors: SceneErrors, replicates: int, seed: int) -> dict[str, list[float]]:
+    intervals = {}
+    for key in INTERVAL_STATISTICS:
+        bounds = bootstrap_interval(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
+        intervals[key] = [100.0 * bound for bound in bounds]
+    return intervals
+
+
+def choose_reference(names: Sequence[str], reference: str | None) -> str:
+    """The row that others are compared with: the one named, else the first product row, else the last.
+
+    Raises:
+        ValueError: the one named is not among the names.
+    """
+    if reference is not None:
+        if reference not in names:
+            raise ValueError(f"reference {reference!r} is not among the methods: {', '.join(names)}")
+        return reference
+    return next((name for name in names if name.endswith("product")), names[-1])
+
+
+def _differences(errors: Mapping[str, SceneErrors], reference: str, replicates: int, seed: int) -> list[dict[str, Any]]:
+    """Reference minus each other method, mean over scenes, per cent points, with 95 % paired bootstrap intervals."""
+    differences = []
+    for name in errors:
+        if name == reference:
+            continue
+        entry: dict[str, Any] = {"method": reference, "minus": name}
+        for key in INTERVAL_STATISTICS:
+            statistic = POSE_STATISTICS[key]
+            value = mean_over_scenes(statistic, errors[reference]) - mean_over_scenes(statistic, errors[name])
+            bounds = paired_bootstrap_interval(
+                errors[reference], errors[name], statistic, replicates=replicates, seed=seed
+            )
+            entry[key] = [100.0 * number for number in (value, *bounds)]
+        differences.append(entry)
+    return differences
+
+
+def _failures(outcomes: SceneOutcomes) -> dict[str, int]:
+    """Number of failures by reason, all seeds counted."""
+    counter = Counter(o.failure for runs in outcomes.values() for run in runs for o in run if o.failure)
+    return dict(counter.most_common())
+
+
+def _unreadable(results: Mapping[str, SceneOutcomes]) -> list[dict[str, Any]]:
+    """Scene, index and reason of each pair that could not be read; every method fails on it alike."""
+    found = {
+        (scene, outcome.pair): outcome.failure.removeprefix(UNREADABLE)
+        for outcomes in results.values()
+        for scene, runs in outcomes.items()
+        for outcome in runs[0]
+        if outcome.unreadable
+    }
+    return [{"scene": scene, "pair": pair, "reason": reason} for (scene, pair), reason in found.items()]
+
+
+def _timing(results: Mapping[str, SceneOutcomes]) -> dict[str, Any]:
+    outcomes = [o for by_scene in results.values() for runs in by_scene.values() for run in runs for o in run]
+    busy = sum(outcome.busy for outcome in outcomes) / len(outcomes)
+    return {"machines": sorted({outcome.machine for outcome in outcomes}), "share_on_busy_machine": busy}
