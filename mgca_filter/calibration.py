@@ -31,6 +31,22 @@ class Calibration:
         return sigmoid(self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
 
 
+def largest_set_of_precision(scores: NDArray[np.float32], precision: float) -> NDArray[np.bool_]:
+    """The most matches (N,) bool, best scores first, whose mean score is at least ``precision``.
+
+    The mean of calibrated scores is the share of right matches to be expected. Equal scores stay together, so that
+    the order of the matches does not matter; where not even the best reach the precision, none is kept.
+    """
+    descending = np.sort(scores.astype(np.float64))[::-1]
+    if not len(descending):
+        return np.zeros(0, dtype=bool)
+    expected = np.cumsum(descending) / np.arange(1, len(descending) + 1)
+    last_of_equals = np.append(descending[:-1] != descending[1:], True)
+    enough = np.flatnonzero((expected >= precision) & last_of_equals)
+    kept: NDArray[np.bool_] = scores >= (descending[enough[-1]] if len(enough) else np.inf)
+    return kept
+
+
 @dataclass(frozen=True)
 class AttributePrior:
     """Logit of a match from its attributes alone: ``weight2 · gelu(weight1 a + bias1) + bias2``.

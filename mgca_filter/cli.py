@@ -22,6 +22,7 @@ from .errors import MgcaFilterError
 from .image_matching import match_images
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
+SUBCOMMANDS = ("colmap", "hloc", "folder")
 _EPILOG = """\
 exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
 1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""
@@ -90,6 +91,12 @@ def build_parser() -> argparse.ArgumentParser:
     matching.add_argument("--max-keypoints", metavar="N", type=_positive(int), default=2000, help="default 2000")
     matching.add_argument("--threshold", metavar="PX", type=_positive(float), default=1.0, help="pixels, default 1.0")
     matching.add_argument(
+        "--keep-precision",
+        metavar="P",
+        type=_positive(float),
+        help="instead of a threshold: expected share of right ones",
+    )
+    matching.add_argument(
         "--method", choices=("prosac", "magsac", "ransac", "poselib", "none"), default="prosac", help="robust fit"
     )
     matching.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
@@ -154,6 +161,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
         K1=K1,
         K2=K2,
         threshold=options.threshold,
+        keep_precision=options.keep_precision,
         method=options.method,
         model=options.model,
         providers=options.providers.split(",") if options.providers else None,
@@ -205,6 +213,11 @@ def _log_to_stderr(level: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
+    words = sys.argv[1:] if arguments is None else arguments
+    if words and words[0] in SUBCOMMANDS and not Path(words[0]).exists():
+        from .integrations.command import main as run_subcommand
+
+        return run_subcommand(words)
     try:
         options = build_parser().parse_args(arguments)
         _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backends import BACKENDS, Providers, shared_backend
+from .calibration import largest_set_of_precision
 from .correspondences import MatchAttributes
 from .option_checks import check_choice, check_integer, check_number, check_path, check_providers
 from .pair_input import MatchPair, PairInput, prepare_pair
@@ -36,14 +37,7 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold: inlier threshold of the mask, pixels (Sampson distance).
-        confidence: of the robust fit, between 0 and 1.
-        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"``, ``"poselib"`` (needs that package) or
-            ``"none"``, which returns scores and a mask of scores above 0.5, no geometry.
-        model: path of a model file; None = the shipped model.
-        providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
-        backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
-        seed: of every random choice.
+        threshold, keep_precision, confidence, method, model, providers, backend, seed: as in :func:`filter_matches`.
 
     Raises:
         TypeError, ValueError: an option is not one of the above.
@@ -56,6 +50,7 @@ class MatchFilter:
         self,
         *,
         threshold: float = 1.0,
+        keep_precision: float | None = None,
         confidence: float = 0.999,
         method: str = "prosac",
         model: str | Path | None = None,
@@ -66,6 +61,9 @@ class MatchFilter:
         check_choice(method, METHODS, "method")
         check_choice(backend, BACKENDS, "backend")
         self.threshold = check_number(threshold, "threshold", 0.0, float("inf"))
+        self.keep_precision = (
+            None if keep_precision is None else check_number(keep_precision, "keep_precision", 0.0, 1.0)
+        )
         self.method = method
         self.fit_options = RobustFitOptions(
             method=method,
@@ -142,7 +140,7 @@ class MatchFilter:
         model = None
         started = time.perf_counter()
         if self.method == "none":
-            verdict = _verdict_by_scores(pair, scores)
+            verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             rows = select_for_fit(logits, job.sent, metadata.decision_threshold, MIN_FIT_MATCHES)
             known = pair.attributes[rows, 5] > 0
@@ -153,6 +151,8 @@ class MatchFilter:
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
             verdict = judge(pair, model, order, self.threshold, self.fit_options)
+            if self.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
+                verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
         return FilterResult(
             mask=verdict.mask,
@@ -171,6 +171,14 @@ class MatchFilter:
                 **verdict.info,
             },
         )
+
+    def _keep_by_scores(self, pair: PairInput, scores: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """Mask (M,) that asks the network alone."""
+        if self.keep_precision is None:
+            return (scores > 0.5) & pair.valid
+        kept = np.zeros(len(scores), dtype=bool)
+        kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.keep_precision)
+        return kept
 
     def _describe(self, job: _Job) -> dict[str, Any]:
         cameras = (job.pair.intrinsics1, job.pair.intrinsics2)
@@ -209,6 +217,7 @@ def filter_matches(
     size1: Any = None,
     size2: Any = None,
     threshold: float = 1.0,
+    keep_precision: float | None = None,
     confidence: float = 0.999,
     method: str = "prosac",
     attributes: MatchAttributes | None = None,
@@ -231,9 +240,12 @@ def filter_matches(
         dist1, dist2: OpenCV distortion coefficients; E and F then hold for undistorted points.
         size1, size2: (width, height), pixels; they help the guess of missing intrinsics.
         threshold: inlier threshold of the mask, pixels (Sampson distance); the fit has its own.
+        keep_precision: instead of a threshold: the mask holds the most matches whose expected precision, the mean of
+            their scores, is at least this (above 0, below 1), whatever their distance to the model. All False where
+            there is no model, as ever.
         confidence: of the robust fit, between 0 and 1.
         method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"``, ``"poselib"`` (needs that package) or
-            ``"none"``, which returns scores and a mask of scores above 0.5, no geometry.
+            ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
@@ -252,6 +264,7 @@ def filter_matches(
     """
     match_filter = MatchFilter(
         threshold=threshold,
+        keep_precision=keep_precision,
         confidence=confidence,
         method=method,
         model=model,
@@ -268,13 +281,11 @@ def filter_many(pairs: Iterable[MatchPair | tuple[Any, Any, Any]], **options: An
     return MatchFilter(**options).filter_many(pairs)
 
 
-def _verdict_by_scores(pair: PairInput, scores: NDArray[np.float32]) -> Verdict:
+def _verdict_by_scores(pair: PairInput, kept: NDArray[np.bool_]) -> Verdict:
     """Answer without a robust fit: the mask is the network's opinion, and there is no geometry to judge."""
-    too_few = count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES
-    mask = (scores > 0.5) & pair.valid & (not too_few)
-    if too_few:
-        return Verdict(Status.TOO_FEW_MATCHES, mask)
-    return Verdict(Status.OK if np.count_nonzero(mask) >= MIN_MATCHES else Status.LOW_SUPPORT, mask)
+    if count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+        return Verdict(Status.TOO_FEW_MATCHES, np.zeros_like(kept))
+    return Verdict(Status.OK if np.count_nonzero(kept) >= MIN_MATCHES else Status.LOW_SUPPORT, kept)
 
 
 def _milliseconds_since(started: float) -> float:

@@ -15,6 +15,7 @@ from conftest import METADATA, SIZE, K, Scene, build_model, make_scene
 
 import mgca_filter
 from mgca_filter import FilterResult, MatchAttributes, MatchFilter, MatchPair, Status, filter_many, filter_matches
+from mgca_filter.calibration import largest_set_of_precision
 from mgca_filter.epipolar import pose_error_deg, sampson_distance
 from mgca_filter.scoring import MAX_NETWORK_MATCHES
 
@@ -177,6 +178,41 @@ def test_what_the_verdict_rejects_can_still_be_seen(model_file: Path) -> None:
     assert result.E is None
     assert result.info["fitted_essential"].shape == (3, 3)
     assert run(make_scene(), model_file, method="none").info["fitted_essential"] is None
+
+
+@pytest.mark.parametrize("precision", [0.55, 0.8, 0.95])
+def test_largest_set_of_precision(precision: float) -> None:
+    scores = np.random.default_rng(0).choice(np.linspace(0, 1, 23), 300).astype(np.float32)
+    kept = largest_set_of_precision(scores, precision)
+    assert scores[kept].mean() >= precision - 1e-6
+    next_best = scores[~kept].max()
+    assert scores[scores >= next_best].mean() < precision
+    assert scores[kept].min() > next_best
+    order = np.random.default_rng(1).permutation(300)
+    np.testing.assert_array_equal(largest_set_of_precision(scores[order], precision), kept[order])
+    assert not largest_set_of_precision(np.full(9, 0.5, np.float32), precision).any()
+    assert largest_set_of_precision(np.zeros(0, np.float32), precision).shape == (0,)
+
+
+@pytest.mark.parametrize("method", ["prosac", "none"])
+def test_keep_precision_replaces_the_threshold(scene: Scene, model_file: Path, method: str) -> None:
+    loose, tight = (run(scene, model_file, method=method, keep_precision=p) for p in (0.7, 0.95))
+    for result, precision in ((loose, 0.7), (tight, 0.95)):
+        np.testing.assert_array_equal(result.mask, largest_set_of_precision(result.scores, precision))
+        assert result.num_inliers == len(result.matches) == result.mask.sum()
+    assert loose.num_inliers > tight.num_inliers > 0
+    np.testing.assert_array_equal(loose.E, run(scene, model_file, method=method, threshold=9.0).E)
+
+
+def test_keep_precision_keeps_nothing_without_a_model(model_file: Path) -> None:
+    lost = make_scene(right=0, wrong=300, seed=1)
+    result = run(lost, model_file, keep_precision=0.1)
+    assert result.E is None
+    assert not result.mask.any()
+    bad = np.where(np.arange(200)[:, None] < 50, np.nan, make_scene().points1)
+    kept = filter_matches(bad, make_scene().points2, None, K1=K, keep_precision=0.01, model=model_file).mask
+    assert kept[50:].all()
+    assert not kept[:50].any()
 
 
 def test_second_intrinsics_default_to_the_first(scene: Scene, model_file: Path) -> None:
