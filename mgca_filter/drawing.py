@@ -37,12 +37,14 @@ class MatchPanel:
         title: the first words of the header, the filter's name or its verdict.
         facts: short phrases that follow in the header, such as "2000 matches".
         success: colours the mark in front of the title, green or red.
+        words: what the legend calls the two colours.
     """
 
     mask: NDArray[np.bool_]
     title: str = ""
     facts: Sequence[str] = ()
     success: bool = True
+    words: tuple[str, str] = ("kept", "rejected")
 
 
 def draw_matches(image1: Image, image2: Image, points1: ArrayLike, points2: ArrayLike, panel: MatchPanel) -> Image:
@@ -172,15 +174,15 @@ def _header(width: int, panel: MatchPanel) -> Image:
         strip[top : top + shrunk.shape[0], 20 : 20 + room] = shrunk
         return strip
     strip[:, 20 : 20 + left] = row
-    legend = _legend()
+    legend = _legend(panel.words)
     if left + legend.shape[1] + gap <= room:
         strip[:, width - legend.shape[1] :] = legend
     return strip
 
 
-def _legend() -> Image:
+def _legend(words: tuple[str, str]) -> Image:
     pieces = []
-    for word, colour in (("kept", _KEPT), ("rejected", _REJECTED)):
+    for word, colour in zip(words, (_KEPT, _REJECTED)):
         swatch = np.full((HEADER_PX, 36, 3), _BACKGROUND, np.uint8)
         cv2.line(swatch, (4, HEADER_PX // 2), (26, HEADER_PX // 2), colour, 2, cv2.LINE_AA)
         pieces += [swatch, _text(word, _TEXT), np.full((HEADER_PX, 18, 3), _BACKGROUND, np.uint8)]

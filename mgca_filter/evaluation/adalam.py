@@ -45,7 +45,7 @@ def locally_affine_matches(pair: ScenePair) -> NDArray[np.bool_]:
 
     config = get_adalam_default_config()
     if attributes.size1 is None or attributes.size2 is None:
-        config["scale_rate_threshold"] = config["detected_scale_rate_threshold"] = None  # type: ignore[typeddict-item]
+        config["scale_rate_threshold"] = None  # type: ignore[typeddict-item]
     if attributes.angle1 is None or attributes.angle2 is None:
         config["orientation_difference_threshold"] = None  # type: ignore[typeddict-item]
     threads = torch.get_num_threads()

@@ -81,22 +81,21 @@ def draw_precision_recall(axes: Any, summary: Mapping[str, Any]) -> None:
     """Precision over recall as the threshold on the logit moves; a dot where it is 0."""
     curves = summary["curves"]["precision_recall"]
     zero = curves["logit"].index(0.0)
-    for name, curve in curves["methods"].items():
+    for name, curve in _different(curves["methods"]).items():
         known = [(r, p) for r, p in zip(curve["recall"], curve["precision"]) if r is not None and p is not None]
         (line,) = axes.plot(*zip(*known), label=name, linewidth=1.5) if known else (None,)
         recall, precision = curve["recall"][zero], curve["precision"][zero]
         if line is not None and recall is not None and precision is not None:
             axes.plot(recall, precision, "o", color=line.get_color(), markersize=5)
-    axes.set(
-        xlabel="recall", ylabel="precision (matches of a scene together, mean over scenes)", xlim=(0, 1), ylim=(0, 1)
-    )
+    axes.set(xlabel="recall (matches of a scene together, mean over scenes)", ylabel="precision")
+    axes.set(xlim=(0, 1.01), ylim=(0, 1.01))
     axes.legend(loc="lower left")
 
 
 def draw_reliability(axes: Any, summary: Mapping[str, Any]) -> None:
     """Share of true matches over the probability that was promised; the diagonal is what it should be."""
     axes.plot([0, 1], [0, 1], color=_GREY, linewidth=1.0, linestyle=":")
-    for name, table in summary["curves"]["reliability"].items():
+    for name, table in _different(summary["curves"]["reliability"]).items():
         bins = table["bins"]
         label = f"{name} (calibration error {100 * table['error']:.1f} %)"
         axes.plot(
@@ -115,9 +114,23 @@ def draw_time_accuracy(axes: Any, summary: Mapping[str, Any]) -> None:
         label = f"{number}  {row['method']}"
         axes.plot(row["median_ms"], row["mAP@20"], "s" if ours else "o", color=colour, markersize=5, label=label)
         axes.annotate(str(number), (row["median_ms"], row["mAP@20"]), (4, 3), textcoords="offset points", fontsize=7)
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     axes.set(xscale="log", xlabel="median time per pair, ms", ylabel="mAP@20, % (mean over scenes)")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter(NullFormatter())
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handletextpad=0.2)
     axes.figure.set_size_inches(9.0, 4.8)
+
+
+def _different(methods: Mapping[str, Any]) -> dict[str, Any]:
+    """Methods without those whose curve another has drawn: rows that share the network's scores."""
+    drawn: dict[str, Any] = {}
+    for name, curve in methods.items():
+        if curve not in drawn.values():
+            drawn[name] = curve
+    return drawn
 
 
 def _headline(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:

@@ -162,7 +162,7 @@ def _read_pair(source: PairSource, index: int) -> ScenePair | DatasetError:
 def _warm_up(method: Method, pair: ScenePair) -> None:
     """Once per process and method, untimed: sessions are opened and buffers allocated outside the measurement."""
     if repr(method) not in _warm_methods:
-        _answer(method, pair, 0)
+        answer_pair(method, pair, 0)
         _warm_methods.add(repr(method))
 
 
@@ -190,7 +190,7 @@ def _unreadable_outcome(index: int, error: DatasetError) -> PairOutcome:
     return PairOutcome(index, FAILURE_DEG, None, None, nothing, nothing, 0.0, 0.0, f"{UNREADABLE}{error}")
 
 
-def _answer(method: Method, pair: ScenePair, seed: int) -> Answer:
+def answer_pair(method: Method, pair: ScenePair, seed: int) -> Answer:
     """The method's answer; what it raises becomes a failure, since a user's pair would be lost just the same."""
     try:
         return method.run(pair, seed)
@@ -202,7 +202,7 @@ def _answer(method: Method, pair: ScenePair, seed: int) -> Answer:
 def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
     """Run a method on one pair, time it and compare its answer with the truth."""
     wall, cpu = time.perf_counter(), time.process_time()
-    answer = _answer(method, pair, seed)
+    answer = answer_pair(method, pair, seed)
     elapsed_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
     truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
     rotation_deg = translation_deg = None

@@ -9,14 +9,17 @@ import cv2
 import numpy as np
 
 from ..drawing import MatchPanel, draw_matches
-from ..epipolar import symmetric_epipolar_distance_squared
+from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..errors import DatasetError
 from ..scene_bundle import ScenePair
 from .methods import Method
-from .metrics import TRUE_INLIER_DISTANCE_SQUARED
+from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED
 from .pairs import SceneSelection
-from .predict import evaluate_pair
+from .predict import answer_pair
 from .sources.base import Image
+
+SOLVED_DEG = 5.0
+"""Pose error below which a strip's mark is green."""
 
 
 def draw_pairs(
@@ -45,10 +48,12 @@ def draw_pairs(
 
 
 def _strip(method: Method, pair: ScenePair, images: tuple[Image, Image]) -> Image:
-    mask = method.run(pair, 0).mask
-    error_deg = evaluate_pair(method, pair, 0).error_deg
+    answer = answer_pair(method, pair, 0)
+    mask, error_deg = answer.mask, FAILURE_DEG
+    if answer.R is not None and answer.t is not None:
+        error_deg = pose_error_deg(answer.R, answer.t, pair.R, pair.t)
     distance = symmetric_epipolar_distance_squared(pair.correspondences, pair.E)
     right = distance[mask] < TRUE_INLIER_DISTANCE_SQUARED
     facts = [f"{np.count_nonzero(right)} right", f"{np.count_nonzero(~right)} wrong", f"pose error {error_deg:.1f} deg"]
-    panel = MatchPanel(right, method.name, facts, success=error_deg < 5.0)
+    panel = MatchPanel(right, method.name, facts, success=error_deg < SOLVED_DEG, words=("right", "wrong"))
     return draw_matches(*images, pair.points1[mask], pair.points2[mask], panel)

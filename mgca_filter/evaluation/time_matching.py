@@ -18,8 +18,9 @@ from .registry import parse_method
 
 SAMPLE_PAIRS = 60
 MIN_ITERATIONS, MAX_ITERATIONS = 50, 1 << 20
-CLOSE_ENOUGH = 0.03
-"""Relative difference of the median times at which the search ends, and below which more iterations change nothing."""
+STALL_ITERATIONS = 16_000  # below it, what every pair costs anyway hides the iterations
+STALLED = 1.03
+"""Twice the iterations take at least this times as long, unless the estimator stops early whatever it is allowed."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +83,17 @@ def _search(name: str, like: str, target_ms: float, pairs: Sequence[ScenePair]) 
         if following == iterations:
             break
         tried[following] = measure(following)
-        stalled = factor > 1 and tried[following] < (1 + CLOSE_ENOUGH) * tried[iterations]
+        stalled = factor > 1 and tried[following] < STALLED * tried[iterations]
         iterations = following
-        if stalled and iterations > 16_000:  # all samples are spent: it stops early whatever it is allowed
+        if stalled and iterations >= STALL_ITERATIONS:
             break
     below = [n for n in tried if tried[n] < target_ms]
     above = [n for n in tried if tried[n] >= target_ms]
     if below and above:
         middle = round(float(np.sqrt(max(below) * min(above))))
         tried[middle] = measure(middle)
-    best = min(tried, key=lambda n: (abs(tried[n] - target_ms) > CLOSE_ENOUGH * target_ms, abs(tried[n] - target_ms)))
+    # Times within a per cent of each other count as the same: then the fewest iterations do.
+    best = min(tried, key=lambda n: (round(abs(tried[n] - target_ms) / target_ms, 2), n))
     return TimeMatch(f"{name} {best} iterations", best, tried[best], like, target_ms)
 
 

@@ -1,0 +1,241 @@
+"""Rivals of other libraries, the network's order, and estimators with the filter's milliseconds."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from conftest import SIZE, K, Scene, make_scene
+from scene_bundles import write_bundle
+
+from mgca_filter import filter_matches
+from mgca_filter.correspondences import MatchAttributes
+from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.evaluation import time_matching
+from mgca_filter.evaluation.__main__ import main
+from mgca_filter.evaluation.methods import Answer
+from mgca_filter.evaluation.predict import evaluate_pair
+from mgca_filter.evaluation.registry import GRID_ROWS, TIME_MATCHED_ROWS, parse_method
+from mgca_filter.evaluation.selection import Selection
+from mgca_filter.evaluation.time_matching import match_times
+from mgca_filter.scene_bundle import ScenePair
+
+ORDERED = "mutual + ratio 0.9 + network order + PROSAC 0.5 px"
+
+
+def as_pair(scene: Scene) -> ScenePair:
+    return ScenePair(
+        *("scene", 0, "a", "b", scene.points1, scene.points2, K, K, SIZE, SIZE, scene.R, scene.t, scene.attributes),
+        mutual=np.ones(len(scene.points1), dtype=bool),
+    )
+
+
+@pytest.fixture
+def pair(scene: Scene) -> ScenePair:
+    return as_pair(scene)
+
+
+@pytest.fixture
+def waving() -> ScenePair:
+    """300 matches that move as one affine patch, and 300 at random."""
+    rng = np.random.default_rng(0)
+    points1 = rng.uniform([40, 40], [600, 440], (600, 2))
+    points2 = points1 @ np.array([[1.05, 0.02], [-0.02, 1.05]]) + [9.0, 4.0]
+    points2[300:] = rng.uniform([0, 0], SIZE, (300, 2))
+    everything = np.full(600, 4.0, dtype=np.float32)
+    ratio = np.where(np.arange(600) < 300, 0.6, 0.9).astype(np.float32)
+    attributes = MatchAttributes(ratio, None, everything, everything, 5 * everything, 5 * everything)
+    scene = make_scene(right=600, wrong=0)
+    return as_pair(dataclasses.replace(scene, points1=points1, points2=points2, attributes=attributes))
+
+
+@pytest.mark.parametrize("name", [*GRID_ROWS, *TIME_MATCHED_ROWS, ORDERED, "AdaLAM + DEGENSAC 1 px 500 iterations"])
+def test_a_rows_name_gives_the_row(name: str):
+    assert parse_method(name).name == name
+
+
+def test_lmeds_has_no_threshold(pair: ScenePair, monkeypatch: pytest.MonkeyPatch):
+    genuine, captured = cv2.findEssentialMat, []
+
+    def spy(*args: Any, **kwargs: Any) -> Any:
+        captured.append(kwargs)
+        return genuine(*args, **kwargs)
+
+    monkeypatch.setattr(cv2, "findEssentialMat", spy)
+    outcome = evaluate_pair(parse_method("ratio 0.8 + LMEDS"), pair, 0)
+    assert captured[0]["method"] == cv2.LMEDS
+    assert outcome.error_deg < 5.0
+    assert parse_method("ratio 0.8 + LMEDS").settings()["estimator"]["threshold_px"] is None
+
+
+def test_degensac_gets_pixels_threshold_seed_and_budget(pair: ScenePair, monkeypatch: pytest.MonkeyPatch):
+    pydegensac = pytest.importorskip("pydegensac")
+    genuine, captured = pydegensac.findFundamentalMatrix, []
+
+    def spy(points1: Any, points2: Any, threshold_px: float, **kwargs: Any) -> Any:
+        captured.append((points1, threshold_px, kwargs))
+        return genuine(points1, points2, threshold_px, **kwargs)
+
+    monkeypatch.setattr(pydegensac, "findFundamentalMatrix", spy)
+    outcome = evaluate_pair(parse_method("ratio 0.9 + DEGENSAC 0.75 px"), pair, 2)
+    assert outcome.error_deg < 5.0
+    assert outcome.mask[0] > 0.8
+    points1, threshold_px, options = captured[0]
+    np.testing.assert_array_equal(points1, pair.points1[pair.attributes.ratio < 0.9])
+    assert (threshold_px, options) == (0.75, {"seed": 2})
+    parse_method("NN + DEGENSAC 0.75 px 3000 iterations").run(pair, 0)
+    assert captured[1][2]["max_iters"] == 3000
+    assert captured[1][2]["conf"] > 1 - 1e-8
+    few = dataclasses.replace(pair, mutual=np.arange(len(pair.points1)) < 7)
+    assert parse_method("mutual + DEGENSAC 1 px").run(few, 0).failure == "fewer than 8 matches"
+
+
+def test_adalam_keeps_what_moves_with_its_neighbours(waving: ScenePair):
+    pytest.importorskip("kornia")
+    kept = Selection(adalam=True).apply(waving)
+    assert kept[:300].mean() > 0.8
+    assert kept[300:].mean() < 0.1
+    np.testing.assert_array_equal(kept, Selection(adalam=True).apply(waving))
+    bare = dataclasses.replace(waving, attributes=MatchAttributes(waving.attributes.ratio))
+    assert Selection(adalam=True).apply(bare)[:300].mean() > 0.8
+    with pytest.raises(ValueError, match="AdaLAM needs the distance ratios"):
+        Selection(adalam=True).apply(dataclasses.replace(waving, attributes=MatchAttributes()))
+
+
+def test_adalam_takes_orientation_and_mutual_matches_into_account(waving: ScenePair):
+    pytest.importorskip("kornia")
+    random = np.random.default_rng(1).uniform(0, 360, 600).astype(np.float32)
+    turned = dataclasses.replace(waving, attributes=dataclasses.replace(waving.attributes, angle2=random))
+    kept, kept_turned = (Selection(adalam=True).apply(pair)[:300].sum() for pair in (waving, turned))
+    assert kept_turned < kept - 5
+    # Without a mutual match there is no seed, and kornia falls back on the squared ratio.
+    seedless = dataclasses.replace(waving, mutual=np.zeros(600, dtype=bool))
+    assert Selection(adalam=True).apply(seedless).all()
+
+
+def test_older_stored_results_keep_their_key():
+    assert Selection(mutual=True, max_ratio=0.9).settings() == {"mutual": True, "max_ratio": 0.9, "gms": False}
+
+
+def test_network_order_sorts_plain_matches_by_logit(pair: ScenePair, model_file: Path, monkeypatch: pytest.MonkeyPatch):
+    genuine, captured = cv2.findEssentialMat, []
+
+    def spy(x1: Any, *args: Any, **kwargs: Any) -> Any:
+        captured.append(x1)
+        return genuine(x1, *args, **kwargs)
+
+    monkeypatch.setattr(cv2, "findEssentialMat", spy)
+    ratio = pair.attributes.ratio
+    mutual = np.arange(len(ratio)) % 3 > 0
+    pair = dataclasses.replace(pair, mutual=mutual)
+    answer = parse_method(ORDERED, str(model_file)).run(pair, 0)
+    np.testing.assert_array_equal(answer.kept, mutual & (ratio < 0.9))
+    result = filter_matches(
+        *(pair.points1, pair.points2, None), K1=K, K2=K, attributes=pair.attributes, model=model_file, method="none"
+    )
+    logits = result.info["logits"]
+    rows = np.flatnonzero(answer.kept)
+    rows = rows[np.argsort(-logits[rows], kind="stable")]
+    np.testing.assert_allclose(captured[-1], (pair.points1[rows] - K[:2, 2]) / 800.0)
+    np.testing.assert_allclose(answer.logits, logits)
+    assert pose_error_deg(answer.R, answer.t, pair.R, pair.t) < 3.0
+
+
+def test_what_is_not_installed_is_listed_and_the_rest_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setitem(sys.modules, "pydegensac", None)
+    path = write_bundle(tmp_path / "hall.npz", [make_scene()])
+    arguments = [str(path), "--bootstrap", "0", "-q", "--methods", "NN + DEGENSAC 1 px"]
+    assert main([*arguments, "NN + MAGSAC 1 px"]) == 0
+    text = capsys.readouterr().out
+    assert "NN + DEGENSAC 1 px: not installed" in text
+    assert "NN + MAGSAC 1 px" in text
+    assert main(arguments) == 2
+    assert "pydegensac" in capsys.readouterr().err
+
+
+# Time-matched rows
+
+
+class ClockedMethod:
+    """Takes a time that is a function of its iterations, on the clock that the test puts in."""
+
+    seeded = False
+
+    def __init__(self, name: str, milliseconds: float, clock: list[float]) -> None:
+        self.name, self._milliseconds, self._clock = name, milliseconds, clock
+
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    def run(self, pair: ScenePair, seed: int) -> Answer:
+        self._clock[0] += self._milliseconds / 1e3
+        nothing = np.zeros(len(pair.points1), dtype=bool)
+        return Answer(None, None, nothing, nothing, "clocked")
+
+
+@pytest.fixture
+def clocked(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Makes methods whose rows cost what ``cost`` says of their iterations; gives the one to match."""
+    from mgca_filter.evaluation import predict
+
+    clock = [0.0]
+    monkeypatch.setattr(predict.time, "perf_counter", lambda: clock[0])
+
+    def install(cost: Any, target_ms: float) -> ClockedMethod:
+        def build(name: str) -> ClockedMethod:
+            iterations = int(name.split()[-2])
+            return ClockedMethod(name, cost(iterations), clock)
+
+        monkeypatch.setattr(time_matching, "parse_method", build)
+        return ClockedMethod("ours", target_ms, clock)
+
+    return install
+
+
+@pytest.mark.parametrize(("target_ms", "per_thousand"), [(50.0, 3.0), (50.0, 400.0), (8.0, 8.0)])
+def test_iterations_are_found_that_take_our_time(target_ms: float, per_thousand: float, clocked: Any, pair: ScenePair):
+    like = clocked(lambda iterations: per_thousand * iterations / 1000, target_ms)
+    (match,) = match_times(["NN + MAGSAC 1 px"], like, [pair])
+    assert match.reached_ms == pytest.approx(target_ms, rel=0.45)
+    assert match.reached_ms == pytest.approx(per_thousand * match.iterations / 1000)
+    assert match.method == f"NN + MAGSAC 1 px {match.iterations} iterations"
+    assert (match.like, match.target_ms) == ("ours", pytest.approx(target_ms))
+
+
+def test_an_estimator_that_stops_early_says_so(clocked: Any, pair: ScenePair):
+    like = clocked(lambda iterations: min(iterations / 1000, 5.0), 50.0)
+    (match,) = match_times(["NN + MAGSAC 1 px"], like, [pair])
+    assert match.reached_ms == pytest.approx(5.0)
+    assert match.iterations <= 64_000
+    like = clocked(lambda iterations: 100.0, 50.0)
+    assert match_times(["NN + MAGSAC 1 px"], like, [pair])[0].iterations == time_matching.MIN_ITERATIONS
+
+
+def test_the_iterations_found_are_kept(clocked: Any, pair: ScenePair, tmp_path: Path):
+    first = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: i / 1000, 50.0), [pair], tmp_path)
+    again = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
+    assert again == first
+    other = match_times(["NN + RANSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
+    assert other[0].target_ms == pytest.approx(70.0)
+
+
+def test_command_adds_time_matched_rows(
+    tmp_path: Path, model_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    import mgca_filter.evaluation.__main__ as command
+
+    monkeypatch.setattr(command, "TIME_MATCHED_ROWS", ("mutual + PROSAC 0.5 px",))
+    monkeypatch.setattr(time_matching, "MAX_ITERATIONS", 2000)
+    path = write_bundle(tmp_path / "hall.npz", [make_scene()])
+    arguments = [str(path), "--methods", "product", "--model", str(model_file), "--time-matched", "product"]
+    assert main([*arguments, "--bootstrap", "0", "-q"]) == 0
+    text = capsys.readouterr().out
+    assert "iterations take" in text
+    assert "mutual + PROSAC 0.5 px " in text
