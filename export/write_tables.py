@@ -1,6 +1,7 @@
-"""Put the scoreboard into README and model card: ``python export/write_tables.py docs/scoreboard.json``.
+"""Put the scoreboard into README, model card and figures: ``python export/write_tables.py docs/scoreboard.json``.
 
-The JSON file comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``.
+The JSON file comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures need
+matplotlib; those that the file holds the curves for are written to ``docs/figures``.
 """
 
 from __future__ import annotations
@@ -8,11 +9,15 @@ from __future__ import annotations
 import argparse
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from mgca_filter.evaluation.figures import draw_figures
+
 ROOT = Path(__file__).resolve().parent.parent
-CARD = ROOT / "mgca_filter" / "models" / "mgca_small.md"
+FILES = ("README.md", "mgca_filter/models/mgca_small.md")
+FIGURES = "docs/figures"
 COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms")
 LABELS = {
     "product": "**mgca_filter**, default options",
@@ -20,6 +25,8 @@ LABELS = {
     "product bare": "**mgca_filter**, bare points (no ratio, size, angle)",
     "network E": "the network's own E, no RANSAC",
     "network RANSAC": "network + RANSAC 1e-3 (the papers' protocol)",
+    "mutual + ratio 0.9 + network order + PROSAC 0.5 px": "mutual + ratio 0.9, sorted by our scores, PROSAC 0.5 px",
+    "mutual + ratio 0.9 + network order + PoseLib progressive 0.75 px": "the same with PoseLib progressive 0.75 px",
 }
 MARKERS = re.compile(r"(<!-- scoreboard -->\n).*?(<!-- /scoreboard -->)", re.DOTALL)
 
@@ -57,22 +64,31 @@ def section(summary: dict[str, Any]) -> str:
         f"OpenCV {versions.get('opencv-contrib-python-headless', '?')}, {summary['machine'].get('processor', 'CPU')}."
         f"{caution} "
         "Command: `python -m mgca_filter.evaluation BUNDLES`; figures with bootstrap intervals, by scene: "
-        "`docs/scoreboard.json`.",
+        "`docs/scoreboard.json`; curves: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
         "",
     ]
     return "\n".join(lines)
 
 
-def main() -> None:
-    """Rewrite the sections between the markers."""
+def fill(content: str, text: str, where: str) -> str:
+    """``content`` with ``text`` between the markers; ``where`` names it in the message when there are none."""
+    if not MARKERS.search(content):
+        raise SystemExit(f"{where}: no scoreboard markers")
+    return MARKERS.sub(lambda match: match[1] + text + match[2], content)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Rewrite the sections between the markers, and the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("scoreboard", type=Path)
-    text = section(json.loads(parser.parse_args().scoreboard.read_text()))
-    for path in (ROOT / "README.md", CARD):
-        content = path.read_text(encoding="utf-8")
-        if not MARKERS.search(content):
-            raise SystemExit(f"{path}: no scoreboard markers")
-        path.write_text(MARKERS.sub(lambda match: match[1] + text + match[2], content), encoding="utf-8")
+    parser.add_argument("--root", type=Path, default=ROOT, help="checkout to write to (default: this one)")
+    options = parser.parse_args(arguments)
+    summary = json.loads(options.scoreboard.read_text(encoding="utf-8"))
+    for name in FILES:
+        path = options.root / name
+        path.write_text(fill(path.read_text(encoding="utf-8"), section(summary), str(path)), encoding="utf-8")
+    for figure in draw_figures(summary, options.root / FIGURES):
+        print(figure)
 
 
 if __name__ == "__main__":
