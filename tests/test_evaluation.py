@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -362,6 +363,24 @@ def test_an_interrupted_run_resumes(folder, tmp_path, monkeypatch):
     results = predict([second], selections, store=ResultStore(tmp_path))
     assert first.seen + second.seen == [("hall/0", 0), ("hall/1", 0), ("hall/2", 0), ("yard/0", 0), ("yard/1", 0)]
     assert all(o.error_deg < 1e-4 for runs in results["counting"].values() for o in runs[0])
+
+
+def test_a_bar_counts_the_pairs_that_are_run(folder, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("tqdm")
+    no_warm_up(monkeypatch)
+    store, selections = ResultStore(tmp_path), select_pairs(folder)
+    predict([CountingMethod([])], selections, store=store, progress=True)
+    assert "5/5" in capsys.readouterr().err
+    predict([CountingMethod([], "other")], selections, store=store)
+    assert capsys.readouterr().err == ""
+
+
+def test_without_tqdm_the_log_counts(folder, monkeypatch, caplog):
+    no_warm_up(monkeypatch)
+    monkeypatch.setitem(sys.modules, "tqdm", None)
+    with caplog.at_level("INFO"):
+        predict([CountingMethod([])], select_pairs(folder), progress=True)
+    assert "5/5  counting, yard, seed 0" in caplog.text
 
 
 def test_stored_results_are_reused_only_for_equal_data_and_settings(folder, tmp_path, monkeypatch):
