@@ -22,8 +22,8 @@ OTHER_SCENES = "our scenes"
 DATA = Path(__file__).with_name("paper_tables.json")
 
 NOTES = (
-    "The paper's P, R and F count logit > 2 and leave out pairs whose value is 0 or NaN; ours are given in that "
-    "variant here, and beside the honest ones in the scoreboard.",
+    "The paper's P, R and F count logit > 2 and leave out pairs whose value is 0 or NaN: compare 'the papers' variant'. "
+    "'all pairs' counts logit > 0, a rival's own selection, and every pair.",
     "The paper's poses come without RANSAC: the row of ours to compare is 'network E'.",
     f"'{OTHER_SCENES}': mean over the scenes of our run that are none of the paper's dumps.",
 )
@@ -42,7 +42,8 @@ def format_paper(summary: Mapping[str, Any] | None, style: Style = "text") -> st
     for table in paper["tables"]:
         header = ["method", *(split["name"] for split in paper["splits"]), OTHER_SCENES]
         body = [[row["method"], *(_join(row[name]) for name in header[1:-1]), NOT_MEASURED] for row in table["rows"]]
-        body += [] if summary is None else _our_rows(summary, paper["splits"], table["ours"])
+        for suffix, metrics in table["ours"].items() if summary is not None else ():
+            body += _our_rows(summary, paper["splits"], suffix, metrics)
         title = f"{table['title']}: {' / '.join(table['metrics'])}, per cent"
         parts.append(render_table(title, header, body, style))
     if style != "latex":
@@ -51,18 +52,19 @@ def format_paper(summary: Mapping[str, Any] | None, style: Style = "text") -> st
 
 
 def _our_rows(
-    summary: Mapping[str, Any], splits: Sequence[Mapping[str, str]], metrics: Sequence[str]
+    summary: Mapping[str, Any], splits: Sequence[Mapping[str, str]], suffix: str, metrics: Sequence[str]
 ) -> list[list[str]]:
+    """One row for each method that has the metrics at all."""
     rows = {(row["method"], row["scene"]): row for row in summary["rows"]}
     dumps = [split["dump"] for split in splits]
     body = []
-    for method in dict.fromkeys(row["method"] for row in summary["rows"]):
+    for method in dict.fromkeys(row["method"] for row in summary["rows"] if metrics[0] in row):
         known = [rows.get((method, dump), {}) for dump in dumps]
         cells = [_join([row.get(metric) for metric in metrics]) for row in known]
         apart = {*dumps, ALL_SCENES, ALL_PAIRS}
         others = [row for (name, scene), row in rows.items() if name == method and scene not in apart]
         means = [_mean([row.get(metric) for row in others]) for metric in metrics]
-        body.append([method, *cells, _join(means)])
+        body.append([method + suffix, *cells, _join(means)])
     return body
 
 
