@@ -22,7 +22,7 @@ OTHER_SCENES = "our scenes"
 DATA = Path(__file__).with_name("paper_tables.json")
 
 NOTES = (
-    "The paper's P, R and F count logit > 2 and leave out pairs whose value is 0 or NaN: compare 'the papers' variant'. "
+    "The paper's P, R and F count logit > 2 and leave out pairs of value 0 or NaN: compare 'the papers' variant'; "
     "'all pairs' counts logit > 0, a rival's own selection, and every pair.",
     "The paper's poses come without RANSAC: the row of ours to compare is 'network E'.",
     f"'{OTHER_SCENES}': mean over the scenes of our run that are none of the paper's dumps.",
@@ -42,8 +42,8 @@ def format_paper(summary: Mapping[str, Any] | None, style: Style = "text") -> st
     for table in paper["tables"]:
         header = ["method", *(split["name"] for split in paper["splits"]), OTHER_SCENES]
         body = [[row["method"], *(_join(row[name]) for name in header[1:-1]), NOT_MEASURED] for row in table["rows"]]
-        for suffix, metrics in table["ours"].items() if summary is not None else ():
-            body += _our_rows(summary, paper["splits"], suffix, metrics)
+        for suffix, metrics in table["ours"].items():
+            body += [] if summary is None else _our_rows(summary, paper["splits"], suffix, metrics)
         title = f"{table['title']}: {' / '.join(table['metrics'])}, per cent"
         parts.append(render_table(title, header, body, style))
     if style != "latex":
