@@ -9,7 +9,10 @@ import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-PACKAGES = ("numpy", "opencv-contrib-python-headless", "opencv-contrib-python", "poselib", "onnxruntime", "mgca-filter")
+PACKAGES = (
+    *("numpy", "opencv-contrib-python-headless", "opencv-contrib-python", "onnxruntime", "mgca-filter"),
+    *("poselib", "pydegensac", "kornia", "torch", "pycolmap"),
+)
 BUSY_SHARE = 0.25
 
 
