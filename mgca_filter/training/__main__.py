@@ -17,36 +17,45 @@ import torch
 import torch.distributed as dist
 
 from ..errors import MgcaFilterError
-from ..scene_bundle import SceneBundle, load_scene_bundles
+from ..evaluation.sources import open_sources as open_pair_sources
+from ..network import MGCANet
+from ..scene_bundle import ScenePair
 from .config import ConfigError, TrainingConfig, load_config
-from .datasets import SceneBundleDataset
+from .datasets import TrainingDataset
 from .loop import DivergedError, Trainer
-from .validation import quick_validation, select_pairs
+from .sources import OpenedSources, open_sources
+from .validation import held_out_pairs, quick_validation, select_pairs
+
+OANET_SUFFIXES = (".hdf5", ".h5")
 
 
-def split_scenes(bundles: Sequence[SceneBundle], config: TrainingConfig) -> tuple[list[SceneBundle], list[SceneBundle]]:
-    """Training and tuning bundles.
+def validation_pairs(config: TrainingConfig, opened: OpenedSources, data: Path, per_scene: int) -> list[ScenePair]:
+    """Pairs of the tuning scenes and of the config's validation files; of training scenes where there are neither."""
+    pairs = select_pairs(opened.tuning, per_scene)
+    for name in config.validation:
+        data_format = "oanet" if Path(name).suffix in OANET_SUFFIXES else "bundle"
+        pairs += select_pairs(open_pair_sources([data / name], data_format), per_scene)
+    return pairs or select_pairs(opened.training, per_scene)
 
-    Raises:
-        ConfigError: a scene that the config names is not among the bundles, or no scene is left to train on.
-    """
-    names = {bundle.scene for bundle in bundles}
-    for key, wanted in (("scenes", config.scenes), ("tuning_scenes", config.tuning_scenes)):
-        missing = [scene for scene in wanted if scene not in names]
-        if missing:
-            raise ConfigError(f"{key}: not in the data folder: {', '.join(missing)}")
-    chosen = names.intersection(config.scenes or names).difference(config.tuning_scenes)
-    if not chosen:
-        raise ConfigError("scenes: nothing is left to train on besides tuning_scenes")
-    tuning = [bundle for bundle in bundles if bundle.scene in config.tuning_scenes]
-    return [bundle for bundle in bundles if bundle.scene in chosen], tuning
+
+def validate(network: MGCANet, unknown: Sequence[ScenePair], known: Sequence[ScenePair]) -> dict[str, float]:
+    """Figures on scenes that training never saw, and, as ``known_…``, on held-out pairs of those that it did."""
+    figures = quick_validation(network, unknown)
+    if known:
+        figures |= {f"known_{name}": value for name, value in quick_validation(network, known).items()}
+    return figures
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(prog="python -m mgca_filter.training", description="Train MGCA-Net.")
     parser.add_argument("--config", type=Path, required=True, help="TOML file, such as training/configs/small.toml")
-    parser.add_argument("--data", type=Path, required=True, help="folder of scene bundles (.npz)")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        required=True,
+        help="folder that the config's sources lie in; scene bundles (.npz) where it names none",
+    )
     parser.add_argument("--run-dir", type=Path, required=True, help="run directory; a checkpoint in it is resumed")
     parser.add_argument("--init", type=Path, help="weights (.safetensors) to start from")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
@@ -54,6 +63,7 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     parser.add_argument("--stop-after", type=int, help="stop after this many steps; resume by the same command")
     parser.add_argument("--validate-every", type=int, default=500, metavar="STEPS")
     parser.add_argument("--validate-pairs", type=int, default=12, metavar="N", help="pairs of each tuning scene")
+    parser.add_argument("--validate-known", type=int, default=0, metavar="N", help="held-out pairs of training scenes")
     return parser.parse_args(arguments)
 
 
@@ -74,23 +84,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     shard = _join_processes(options)
     try:
         config = load_config(options.config)
-        training, tuning = split_scenes(load_scene_bundles(options.data), config)
-        dataset = SceneBundleDataset(
-            training, config.sampling, config.augmentation, config.seed, config.schedule.steps, shard
+        if config.sampling.batch_size % shard[1]:
+            raise ConfigError(
+                f"{options.config}: sampling.batch_size: {config.sampling.batch_size} pairs do not divide among "
+                f"{shard[1]} processes"
+            )
+        opened = open_sources(config, options.data)
+        pairs = validation_pairs(config, opened, options.data, options.validate_pairs)
+        known = held_out_pairs(opened.training, config.sampling.holdout_every, options.validate_known)
+        dataset = TrainingDataset(
+            opened.source, config.sampling, config.augmentation, config.seed, config.schedule.steps, shard
         )
-        validate = partial(quick_validation, pairs=select_pairs(tuning or training, options.validate_pairs))
         trainer = Trainer(
             config,
             dataset,
             options.run_dir,
-            validate,
+            partial(validate, unknown=pairs, known=known) if pairs else None,
             options.validate_every,
             options.device,
             options.workers,
             options.init,
         )
         trainer.run(options.stop_after)
-    except (ConfigError, MgcaFilterError) as error:
+    except (ConfigError, MgcaFilterError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except DivergedError as error:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
 
+from ..correspondences import MatchAttributes
 from ..epipolar import symmetric_epipolar_distance_squared, triangulated_depths
-from ..scene_bundle import ScenePair
 
 POSITIVE_DISTANCE = 1.5e-5  # squared symmetric epipolar distance, normalised coordinates
 NEGATIVE_DISTANCE = 1e-4  # the field's threshold
@@ -17,7 +19,24 @@ DEPTH_PERCENTILES = (3.0, 97.0)
 POSITIVE, NEGATIVE, IGNORED = 1, 0, -1
 
 
-def clean_labels(pair: ScenePair) -> NDArray[np.int8]:
+class PosedPair(Protocol):
+    """Matches with a true pose, such as :class:`mgca_filter.scene_bundle.ScenePair`."""
+
+    @property
+    def correspondences(self) -> NDArray[np.float64]: ...
+    @property
+    def E(self) -> NDArray[np.float64]: ...
+    @property
+    def R(self) -> NDArray[np.float64]: ...
+    @property
+    def t(self) -> NDArray[np.float64]: ...
+    @property
+    def attributes(self) -> MatchAttributes: ...
+    @property
+    def mutual(self) -> NDArray[np.bool_]: ...
+
+
+def clean_labels(pair: PosedPair) -> NDArray[np.int8]:
     """1 = right, 0 = wrong, −1 = left out of the loss, for each raw match (M,).
 
     Right: within 1.5e-5 of the true epipolar geometry, in front of both cameras, and at a depth inside half
@@ -36,3 +55,9 @@ def clean_labels(pair: ScenePair) -> NDArray[np.int8]:
     labels[distance > NEGATIVE_DISTANCE] = NEGATIVE
     labels[close] = POSITIVE
     return labels
+
+
+def epipolar_labels(correspondences: NDArray[np.float64], E: NDArray[np.float64]) -> NDArray[np.int8]:
+    """The field's labels (M,): 1 within 1e-4 of the true epipolar geometry, 0 beyond."""
+    near = symmetric_epipolar_distance_squared(correspondences, E) < NEGATIVE_DISTANCE
+    return np.where(near, POSITIVE, NEGATIVE).astype(np.int8)

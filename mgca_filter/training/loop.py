@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import json
-import math
+import os
 import time
 from collections.abc import Callable
 from copy import deepcopy
+from datetime import timedelta
 from pathlib import Path
-from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -21,38 +19,31 @@ from tqdm import tqdm
 from ..network import MGCANet, load_network, save_network
 from .checkpoint import restore_checkpoint, save_checkpoint
 from .config import ScheduleConfig, TrainingConfig
-from .datasets import SceneBundleDataset
+from .datasets import TrainingDataset
 from .loss import balanced_cross_entropy, network_loss, precision_recall
+from .run_directory import RunDirectory
+from .schedule import LossWatch, learning_rate
 
 LOG_EVERY = 20
 SAVE_EVERY = 200
-CHECKPOINT, WEIGHTS, LOG, VALIDATION = "checkpoint.pt", "weights.safetensors", "train.csv", "validation.csv"
+CHECKPOINT, WEIGHTS = "checkpoint.pt", "weights.safetensors"
 
 Validation = Callable[[MGCANet], dict[str, float]]
 
 
 class DivergedError(RuntimeError):
-    """The loss is no longer a number; the batch that did it was saved."""
-
-
-def learning_rate(schedule: ScheduleConfig, step: int) -> float:
-    """Learning rate of a step: linear warm-up, then a cosine down to a fraction of the peak."""
-    if step < schedule.warmup_steps:
-        return schedule.learning_rate * (step + 1) / schedule.warmup_steps
-    progress = (step - schedule.warmup_steps) / max(schedule.steps - schedule.warmup_steps, 1)
-    cosine = 0.5 * (1.0 + math.cos(math.pi * min(progress, 1.0)))
-    return schedule.learning_rate * (schedule.final_fraction + (1.0 - schedule.final_fraction) * cosine)
+    """The loss is no longer a number, or grows; the batch that did it was saved."""
 
 
 class Trainer:
-    """One run in one directory: ``config.json``, ``checkpoint.pt``, ``train.csv``, ``validation.csv`` and
-    ``weights.safetensors``, the averaged weights after the last save.
+    """One run in one directory: ``checkpoint.pt``, ``weights.safetensors`` (the averaged weights after the last save),
+    and what :class:`RunDirectory` writes.
 
     Args:
         config: the run.
         dataset: batches by step.
         folder: run directory; a checkpoint in it is resumed.
-        validate: figures of a network, every ``validate_every`` steps and at the end.
+        validate: figures of a network in per cent, every ``validate_every`` steps and at the end; None = never.
         device: torch device.
         workers: processes that prepare batches; 0 prepares them in this one.
         initial_weights: weights to start from, of the same network.
@@ -61,9 +52,9 @@ class Trainer:
     def __init__(
         self,
         config: TrainingConfig,
-        dataset: SceneBundleDataset,
+        dataset: TrainingDataset,
         folder: Path,
-        validate: Validation,
+        validate: Validation | None,
         validate_every: int = 500,
         device: str = "cpu",
         workers: int = 1,
@@ -84,12 +75,12 @@ class Trainer:
         self.optimizer = _optimizer(self.network, config.schedule)
         folder.mkdir(parents=True, exist_ok=True)
         self.step = 0
+        self.watch = LossWatch()
         if (folder / CHECKPOINT).is_file():
-            self.step = restore_checkpoint(folder / CHECKPOINT, config, self.network, self.average, self.optimizer)
-        if self.is_main:
-            for name in (LOG, VALIDATION):
-                _drop_rows_after(folder / name, self.step)
-            (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2))
+            self.step = restore_checkpoint(
+                folder / CHECKPOINT, config, self.network, self.average, self.optimizer, self.watch
+            )
+        self.directory = RunDirectory(folder, config, self.step) if self.is_main else None
 
     def run(self, stop_after: int | None = None) -> None:
         """Train to the end of the schedule, or for ``stop_after`` steps."""
@@ -98,34 +89,52 @@ class Trainer:
             last = min(last, self.step + stop_after)
         loader = DataLoader(
             self.dataset,
-            batch_size=None,
-            sampler=range(self.step, last),
+            batch_sampler=self.dataset.pools(self.step, last),
+            collate_fn=list,
             num_workers=self.workers,
-            prefetch_factor=4 if self.workers else None,
+            prefetch_factor=2 if self.workers else None,
         )
         total = self.config.schedule.steps
         with tqdm(total=total, initial=self.step, unit="step", smoothing=0.05, disable=not self.is_main) as progress:
             clock = time.perf_counter()
-            for batch in loader:
-                figures = self._train_step({name: tensor.to(self.device) for name, tensor in batch.items()})
-                self.step += 1
-                progress.update()
-                if not self.is_main:
-                    continue
-                if self.step % LOG_EVERY == 0:
-                    seconds, clock = time.perf_counter() - clock, time.perf_counter()
-                    figures["samples_per_s"] = LOG_EVERY * self.config.sampling.batch_size / seconds
-                    _append_row(self.folder / LOG, {"step": self.step, **figures})
-                    progress.set_postfix(loss=f"{figures['loss']:.3f}", recall=f"{figures['recall']:.2f}")
-                if self.step % self.validate_every == 0 or self.step == total:
-                    _append_row(self.folder / VALIDATION, {"step": self.step, **self.validate(self.average)})
-                if self.step % SAVE_EVERY == 0 or self.step == last:
-                    self.save()
+            for pool in loader:
+                for batch in pool:
+                    figures = self._train_step({name: tensor.to(self.device) for name, tensor in batch.items()})
+                    self.step += 1
+                    progress.update()
+                    if self.step % LOG_EVERY == 0:
+                        seconds, clock = time.perf_counter() - clock, time.perf_counter()
+                        self._log(figures, seconds, progress)
+                    if self.step % self.validate_every == 0 or self.step == total:
+                        self._validate()
+                    if self.step % SAVE_EVERY == 0 or self.step == last:
+                        self.save()
 
     def save(self) -> None:
-        """Write checkpoint and averaged weights."""
-        save_checkpoint(self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer)
-        save_network(self.average, self.folder / WEIGHTS, {"name": self.config.name, "steps": str(self.step)})
+        """Write checkpoint and averaged weights; a crash in the middle leaves the previous files whole."""
+        if not self.is_main:
+            return
+        save_checkpoint(
+            self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer, self.watch
+        )
+        temporary = self.folder / f"{WEIGHTS}.partial"
+        save_network(self.average, temporary, {"name": self.config.name, "steps": str(self.step)})
+        os.replace(temporary, self.folder / WEIGHTS)
+
+    def _log(self, figures: dict[str, float], seconds: float, progress: tqdm[None]) -> None:
+        """Write a row, and say how fast the run is and how long it will take."""
+        if self.directory is None:
+            return
+        speed = LOG_EVERY * self.config.sampling.batch_size / seconds
+        self.directory.log(self.step, {**figures, "samples_per_s": speed})
+        left = timedelta(seconds=round(seconds / LOG_EVERY * (self.config.schedule.steps - self.step)))
+        progress.set_postfix_str(
+            f"loss {figures['loss']:.3f}, recall {figures['recall']:.2f}, {speed:.0f} samples/s, {left} left"
+        )
+
+    def _validate(self) -> None:
+        if self.directory is not None and self.validate is not None:
+            self.directory.add_validation(self.step, self.validate(self.average))
 
     def _train_step(self, batch: dict[str, Tensor]) -> dict[str, float]:
         schedule = self.config.schedule
@@ -147,6 +156,8 @@ class Trainer:
         norm = nn.utils.clip_grad_norm_(self.network.parameters(), schedule.clip_norm)
         if not (torch.isfinite(loss) and torch.isfinite(norm)):
             self._stop(batch, "loss or gradient is not finite")
+        if self.watch.diverges(float(loss.detach()), schedule.divergence_factor):
+            self._stop(batch, f"the loss has grown to {self.watch.average:.3f} from {self.watch.lowest:.3f}")
         self.optimizer.step()
         self._update_average()
         if (self.step + 1) % LOG_EVERY:
@@ -167,7 +178,7 @@ class Trainer:
     def _stop(self, batch: dict[str, Tensor], reason: str) -> None:
         rank = dist.get_rank() if dist.is_initialized() else 0
         path = self.folder / f"diverged_{self.step}_{rank}.pt"
-        torch.save(batch, path)
+        torch.save({name: tensor.cpu() for name, tensor in batch.items()}, path)
         raise DivergedError(f"step {self.step}: {reason}; the batch lies in {path}")
 
 
@@ -176,25 +187,3 @@ def _optimizer(network: nn.Module, schedule: ScheduleConfig) -> torch.optim.Opti
     vectors = [p for p in network.parameters() if p.dim() <= 1]
     groups = [{"params": matrices, "weight_decay": schedule.weight_decay}, {"params": vectors, "weight_decay": 0.0}]
     return torch.optim.AdamW(groups, lr=schedule.learning_rate)
-
-
-def _append_row(path: Path, row: dict[str, Any]) -> None:
-    new = not path.is_file()
-    with open(path, "a", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(row))
-        if new:
-            writer.writeheader()
-        writer.writerow(row)
-
-
-def _drop_rows_after(path: Path, step: int) -> None:
-    """Forget what a killed run logged beyond its last checkpoint, and a last row that it left unfinished."""
-    if not path.is_file():
-        return
-    header, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
-    if step == 0 or not header:
-        path.unlink()
-        return
-    whole = [row for row in rows if row.count(",") == header.count(",")]
-    kept = [row for row in whole if int(row.split(",", 1)[0]) <= step]
-    path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,16 +18,35 @@ from ..evaluation.metrics import (
     precision_recall_f,
 )
 from ..network import MGCANet
-from ..robust_fit import estimate_pose, match_order, pose_from_essential
+from ..ranking import RankedMatches, match_order
+from ..robust_fit import estimate_pose, pose_from_essential
 from ..scene_bundle import SceneBundle, ScenePair
+from .sources.bundles import is_held_out
 
 
-def select_pairs(bundles: Sequence[SceneBundle], per_scene: int) -> list[ScenePair]:
+class PairSequence(Protocol):
+    """Pairs by number, such as a :class:`SceneBundle` has them."""
+
+    def __len__(self) -> int: ...
+    def __getitem__(self, index: int, /) -> ScenePair: ...
+
+
+def select_pairs(bundles: Sequence[PairSequence], per_scene: int) -> list[ScenePair]:
     """At most ``per_scene`` pairs of each scene, evenly spaced."""
     chosen = []
     for bundle in bundles:
         indices = np.unique(np.linspace(0, len(bundle) - 1, min(per_scene, len(bundle))).astype(int))
         chosen += [bundle[int(index)] for index in indices]
+    return chosen
+
+
+def held_out_pairs(bundles: Sequence[SceneBundle], holdout_every: int, per_scene: int) -> list[ScenePair]:
+    """At most ``per_scene`` of the pairs of each training scene that training never sees."""
+    chosen = []
+    for bundle in bundles:
+        kept = [index for index in range(len(bundle)) if is_held_out(index, holdout_every)]
+        places = np.unique(np.linspace(0, len(kept) - 1, min(per_scene, len(kept))).astype(int))
+        chosen += [bundle[kept[int(place)]] for place in places]
     return chosen
 
 
@@ -57,9 +77,8 @@ def _evaluate_pair(network: MGCANet, pair: ScenePair) -> tuple[float, float, flo
     accepted[rows] = logits > 0
     precision, recall, _ = precision_recall_f(accepted, truth)
     scores = 1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0)))
-    order = match_order(scores.astype(np.float32), attributes[:, 0], attributes[:, 5] > 0)
-    kept = order[logits[order] > 0]
-    fit = estimate_pose(x, kept if len(kept) >= 32 else order[:32], mean_focal_length(pair.K1, pair.K2))
+    order = match_order(scores, attributes[:, 0], attributes[:, 5] > 0)
+    fit = estimate_pose(RankedMatches.of(x, order, scores, logits), mean_focal_length(pair.K1, pair.K2))
     best = np.argsort(-logits)[: max(len(logits) // 10, 8)]
     own = pose_from_essential(output.essential[0].numpy().astype(np.float64), x[best])
     return precision, recall, _error(fit, pair), _error(own, pair)

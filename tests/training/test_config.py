@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from mgca_filter.network import PRESETS, NetworkConfig
 from mgca_filter.training.augmentation import AugmentationConfig
-from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig, load_config
-from mgca_filter.training.datasets import SamplingConfig
+from mgca_filter.training.config import (
+    ConfigError,
+    ScheduleConfig,
+    SourceConfig,
+    TrainingConfig,
+    config_from_dict,
+    load_config,
+)
+from mgca_filter.training.sampling import SamplingConfig
 
 CONFIGS = Path(__file__).parents[2] / "mgca_filter" / "training" / "configs"
 
@@ -29,6 +37,13 @@ def test_every_table_is_read(tmp_path):
         name = "x"
         seed = 3
         tuning_scenes = ["hall"]
+        validation = ["val.hdf5"]
+        [[sources]]
+        weight = 3
+        [[sources]]
+        kind = "rendered"
+        path = "photos"
+        labels = "epipolar"
         [network]
         preset = "paper"
         stages = 2
@@ -43,6 +58,9 @@ def test_every_table_is_read(tmp_path):
     """
     config = load_config(write(tmp_path, text))
     assert config.seed == 3
+    assert config.validation == ("val.hdf5",)
+    assert config.sources == (SourceConfig(weight=3.0), SourceConfig("rendered", "photos", 1.0, "epipolar"))
+    assert config_from_dict(json.loads(json.dumps(config.to_dict())), "again") == config
     assert config.tuning_scenes == ("hall",)
     assert config.network == NetworkConfig(**{**vars(PRESETS["paper"]), "stages": 2})
     assert config.sampling == SamplingConfig(matches=(100, 200), matches_weights=(1.0, 0.5))
@@ -61,6 +79,14 @@ def test_every_table_is_read(tmp_path):
         ('name = "x"\ntuning_scenes = "hall"', "tuning_scenes"),
         ('name = "x"\ntuning_scenes = [1]', "tuning_scenes"),
         ('name = "x"\nsampling = 3', "sampling"),
+        ('name = "x"\nsources = 3', "sources"),
+        ('name = "x"\nsources = []', "sources"),
+        ('name = "x"\n[[sources]]\nkind = "foto"', r"sources\[0\].kind"),
+        ('name = "x"\n[[sources]]\n[[sources]]\npaht = "a"', r"sources\[1\].paht: unknown key"),
+        ('name = "x"\n[[sources]]\nweight = 0', r"sources\[0\]: weight"),
+        ('name = "x"\n[[sources]]\nkind = "synthetic"\npath = "a"', r"sources\[0\]: path"),
+        ('name = "x"\n[schedule]\nmilestones = [1]', "schedule: milestones"),
+        ('name = "x"\n[schedule]\nsteps = 0', "schedule: steps"),
         ('name = "x"\nnetwork = 3', "network"),
         ('name = "x"\n[network]\nchanels = 8', "network.*chanels"),
         ('name = "x"\n[network]\nchannels = "8"', "network.*channels"),
@@ -99,6 +125,6 @@ def test_missing_and_binary_files_are_named(tmp_path):
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_configs_are_valid(path):
     config = load_config(path)
-    assert config.scenes or config.tuning_scenes
+    assert config.scenes or config.tuning_scenes or config.validation
     assert not set(config.scenes) & set(config.tuning_scenes)
     assert config.schedule.steps > config.schedule.warmup_steps

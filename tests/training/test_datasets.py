@@ -15,20 +15,22 @@ from torch.utils.data import DataLoader
 
 from mgca_filter.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.errors import BundleError
-from mgca_filter.scene_bundle import SceneBundle
+from mgca_filter.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.training.augmentation import AugmentationConfig
-from mgca_filter.training.datasets import (
+from mgca_filter.training.datasets import TrainingDataset
+from mgca_filter.training.labels import POSITIVE, clean_labels
+from mgca_filter.training.pairs import TrainingPair
+from mgca_filter.training.samples import (
     PRIOR_MATCHES,
-    SamplingConfig,
-    SceneBundleDataset,
-    is_held_out,
+    DegenerateDataError,
+    build_sample,
+    has_variety,
     virtual_correspondences,
 )
-from mgca_filter.training.labels import POSITIVE, clean_labels
+from mgca_filter.training.sampling import SamplingConfig
+from mgca_filter.training.sources.bundles import BundleSource, is_held_out
 
-SAMPLING = SamplingConfig(
-    batch_size=4, matches=(40, 64), matches_weights=(0.5, 0.5), holdout_every=3, pool_batches=2
-)
+SAMPLING = SamplingConfig(batch_size=4, matches=(40, 64), matches_weights=(0.5, 0.5), holdout_every=3, pool_batches=2)
 UNCHANGED = AugmentationConfig(tilt_deg=0.0, roll_deg=0.0, turn=0.0, mirror=0.0, focal_error=0.0)
 GEOMETRY, RATIO_AND_BEST = [2, 3, 4, 7], [0, 1, 5, 6]
 
@@ -55,8 +57,21 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> list[SceneBundle]:
     return bundles
 
 
-def build(bundles: list[SceneBundle], seed: int = 0, **changes: object) -> SceneBundleDataset:
-    return SceneBundleDataset(bundles, dataclasses.replace(SAMPLING, **changes), AugmentationConfig(), seed, 12)
+def build(bundles: list[SceneBundle], seed: int = 0, **changes: object) -> TrainingDataset:
+    sampling = dataclasses.replace(SAMPLING, **changes)
+    source = BundleSource(bundles, sampling.scene_exponent, sampling.holdout_every)
+    return TrainingDataset(source, sampling, AugmentationConfig(), seed, 12)
+
+
+def place(pair: TrainingPair) -> tuple[int, int]:
+    """Bundle and number of a pair of the two scenes."""
+    scene, index = pair.name.split("/")
+    return ("hall", "yard").index(scene), int(index)
+
+
+def scene_pair(bundles: list[SceneBundle], pair: TrainingPair) -> ScenePair:
+    scene, index = place(pair)
+    return bundles[scene][index]
 
 
 def assert_equal(batch: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> None:
@@ -83,6 +98,47 @@ def test_workers_change_nothing(bundles, workers):
     expected = build(bundles)
     for step, batch in zip(range(2, 6), loader, strict=True):
         assert_equal(batch, expected[step])
+
+
+def test_pools_are_whole_and_change_nothing(bundles):
+    dataset = build(bundles)
+    assert dataset.pools(3, 9) == [[3], [4, 5], [6, 7], [8]]
+    assert dataset.pools(2, 3) == [[2]]
+    assert dataset.pools(4, 4) == []
+    for workers in (0, 2):
+        loader = DataLoader(dataset, batch_sampler=dataset.pools(1, 5), collate_fn=list, num_workers=workers)
+        batches = [batch for pool in loader for batch in pool]
+        for step, batch in zip(range(1, 5), batches, strict=True):
+            assert_equal(batch, build(bundles)[step])
+
+
+def test_processes_share_a_batch_between_them(bundles):
+    whole = build(bundles)
+    source, arguments = whole.source, (SAMPLING, AugmentationConfig(), 0, 12)
+    shares = [TrainingDataset(source, *arguments, (rank, 2))[3] for rank in range(2)]
+    for name, tensor in whole[3].items():
+        assert torch.equal(tensor[0::2], shares[0][name])
+        assert torch.equal(tensor[1::2], shares[1][name])
+    with pytest.raises(ValueError, match="batch_size.*3 processes"):
+        TrainingDataset(source, *arguments, (0, 3))
+
+
+class OneMatch:
+    """A source whose matches are all the same."""
+
+    def draw(self, rng: np.random.Generator) -> TrainingPair:
+        scene = make_scene(seed=int(rng.integers(5)))
+        x = np.tile(rng.uniform(-0.5, 0.5, 4), (200, 1))
+        return TrainingPair("one/0", x, scene.R, scene.t, scene.attributes, np.ones(200, dtype=bool))
+
+
+def test_pairs_whose_matches_are_all_alike_are_never_drawn():
+    x = np.random.default_rng(0).uniform(-1, 1, (16, 4))
+    assert has_variety(x)
+    assert not has_variety(x[:15])
+    assert not has_variety(np.hstack([x[:, :2], np.tile(x[:1, 2:], (16, 1))]))
+    with pytest.raises(DegenerateDataError, match="one/0"):
+        TrainingDataset(OneMatch(), SAMPLING, AugmentationConfig(), 0, 4)[0]
 
 
 def test_datasets_travel_to_spawned_workers(bundles):
@@ -113,15 +169,15 @@ def test_held_out_pairs_are_never_drawn(bundles):
     assert [index for index in range(9) if is_held_out(index, 3)] == [1, 4, 7]
     assert not any(is_held_out(index, 0) for index in range(100))
     dataset = build(bundles)
-    drawn = {(draw.scene, draw.pair) for draw in (dataset.draw((0, i)) for i in range(300))}
+    drawn = {place(dataset.draw((0, i)).pair) for i in range(300)}
     assert drawn == {(0, index) for index in (0, 2, 3, 5, 6)} | {(1, 0)}
 
 
 @pytest.mark.parametrize(("exponent", "share"), [(0.0, 1 / 2), (0.5, 2 / 3), (1.0, 8 / 10)])
 def test_scenes_are_drawn_by_their_exponent(bundles, exponent, share):
     dataset = build(bundles, scene_exponent=exponent, holdout_every=0)
-    np.testing.assert_allclose(dataset.scene_probability, [share, 1 - share])
-    drawn = [dataset.draw((1, i)).scene for i in range(200)]
+    np.testing.assert_allclose(dataset.source.scene_probability, [share, 1 - share])
+    drawn = [place(dataset.draw((1, i)).pair)[0] for i in range(200)]
     assert abs(np.mean(drawn) - (1 - share)) < 0.12
 
 
@@ -142,7 +198,7 @@ def test_candidates_are_best_of_the_list_and_below_the_ratio(bundles):
         kept = draw.attributes[draw.rows]
         assert (kept[:, 0] < 0.95).all()
         assert (kept[:, 1] == 1).all()
-        encoded = bundles[draw.scene][draw.pair].attributes.encode(len(draw.attributes))
+        encoded = scene_pair(bundles, draw.pair).attributes.encode(len(draw.attributes))
         assert len(draw.rows) == np.count_nonzero((encoded[:, 0] < 0.95) & (encoded[:, 1] == 1))
         np.testing.assert_array_equal(draw.attributes[:, RATIO_AND_BEST], encoded[:, RATIO_AND_BEST])
         forgotten += int((draw.attributes[:, GEOMETRY] == 0).all())
@@ -156,24 +212,29 @@ def test_bare_lists_know_nothing_and_lack_nothing(bundles):
 
 
 def test_filtered_lists_passed_a_ratio_test_or_a_cross_check(bundles):
-    kinds, known = set(), set()
-    for draw in draws(bundles, "filtered"):
-        pair = bundles[draw.scene][draw.pair]
+    kinds, known, thinned = set(), set(), 0
+    for draw in draws(bundles, "filtered", 120):
+        pair = scene_pair(bundles, draw.pair)
         by_ratio = bool((pair.attributes.ratio[draw.rows] < 0.9).all())
         by_cross_check = bool(pair.mutual[draw.rows].all())
-        kinds.add((by_ratio, by_cross_check))
+        by_best = bool(pair.attributes.best[draw.rows].all())
+        kinds.add((by_ratio, by_cross_check, by_best and not by_ratio and not by_cross_check))
+        thinned += int(
+            len(draw.rows) < 0.6 * min(np.count_nonzero(pair.mutual), np.count_nonzero(pair.attributes.best))
+        )
         known.add((bool(draw.attributes[:, 5].any()), bool(draw.attributes[:, 7].any())))
         assert len(draw.rows) >= 32
-    assert {(True, False), (False, True), (True, True)} <= kinds
+    assert {(True, False, False), (False, True, False), (True, True, False), (False, False, True)} <= kinds
+    assert thinned > 0
     assert known == {(True, True), (True, False), (False, True), (False, False)}
 
 
 def test_samples_are_their_pairs_where_nothing_is_changed(bundles):
-    dataset = SceneBundleDataset(bundles, dataclasses.replace(SAMPLING, **only("candidates")), UNCHANGED, 0, 4)
+    dataset = build(bundles, **only("candidates"))
     for i in range(5):
         draw = dataset.draw((3, i))
-        sample = dataset.build_sample(draw, 40)
-        pair = bundles[draw.scene][draw.pair]
+        sample = build_sample(draw, 40, UNCHANGED)
+        pair = scene_pair(bundles, draw.pair)
         everything = pair.correspondences.astype(np.float32)
         rows = [int(np.flatnonzero((everything == row).all(1))[0]) for row in sample["correspondences"]]
         assert len(set(rows)) == 40
@@ -188,7 +249,7 @@ def test_right_matches_and_virtual_points_share_one_geometry(bundles, regime):
     dataset = build(bundles, **only(regime))
     checked = 0
     for i in range(12):
-        sample = dataset.build_sample(dataset.draw((4, i)), 60)
+        sample = build_sample(dataset.draw((4, i)), 60, AugmentationConfig())
         assert sample["virtual_valid"] == 1
         # The geometry is that of the virtual points: solve it from them, without the dataset's help.
         x1, x2 = (np.hstack([p, np.ones((400, 1))]) for p in np.hsplit(sample["virtual"].astype(float), 2))
@@ -217,18 +278,18 @@ def test_virtual_points_lie_on_the_geometry(bundles):
 def test_pairs_with_few_right_matches_have_no_virtual_points(bundles):
     dataset = build(bundles)
     draw = dataset.draw((5, 0))
-    wrong = np.flatnonzero(clean_labels(bundles[draw.scene][draw.pair]) != POSITIVE)
-    assert dataset.build_sample(dataclasses.replace(draw, rows=wrong), 30)["virtual_valid"] == 0
+    wrong = np.flatnonzero(clean_labels(scene_pair(bundles, draw.pair)) != POSITIVE)
+    assert build_sample(dataclasses.replace(draw, rows=wrong), 30, UNCHANGED)["virtual_valid"] == 0
 
 
 def test_pairs_with_few_matches_are_left_out(tmp_path: Path):
     scenes = [make_scene(seed=0, right=20, wrong=11), make_scene(seed=1, right=20, wrong=12)]
     bundle = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes))
     dataset = build([bundle], holdout_every=0)
-    assert dataset.pairs == [[1]]
+    assert dataset.source.pairs == [[1]]
     assert dataset[0]["labels"].shape == (4, 32)
     poor = SceneBundle(write_bundle(tmp_path / "poor.npz", scenes[:1]))
-    assert build([poor, bundle], holdout_every=0, scene_exponent=0.0).scene_probability.tolist() == [0.0, 1.0]
+    assert build([poor, bundle], holdout_every=0, scene_exponent=0.0).source.scene_probability.tolist() == [0.0, 1.0]
     for nothing in ([poor], []):
         with pytest.raises(BundleError, match="32 matches"):
             build(nothing)

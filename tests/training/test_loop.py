@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,15 @@ from scene_bundles import write_bundle
 from mgca_filter.network import MGCANet, load_network, save_network
 from mgca_filter.network.weights import read_metadata
 from mgca_filter.scene_bundle import SceneBundle
-from mgca_filter.training import loop
+from mgca_filter.training import loop, run_directory, schedule
 from mgca_filter.training.__main__ import main
 from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig
-from mgca_filter.training.datasets import SamplingConfig, SceneBundleDataset
-from mgca_filter.training.loop import CHECKPOINT, DivergedError, Trainer, learning_rate
+from mgca_filter.training.datasets import TrainingDataset
+from mgca_filter.training.loop import CHECKPOINT, DivergedError, Trainer
+from mgca_filter.training.run_directory import LOG, VALIDATION
+from mgca_filter.training.sampling import SamplingConfig
+from mgca_filter.training.schedule import LossWatch, learning_rate
+from mgca_filter.training.sources.bundles import BundleSource
 from mgca_filter.training.validation import quick_validation, select_pairs
 
 STEPS = 6
@@ -43,18 +48,16 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> SceneBundle:
 def _log_every_second_step(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop, "LOG_EVERY", 2)
     monkeypatch.setattr(loop, "SAVE_EVERY", 2)
+    monkeypatch.setattr(run_directory, "draw_curves", lambda *arguments: None)  # slow; whole_run has them
 
 
 def fingerprint(network: MGCANet) -> dict[str, float]:
     return {"weights": sum(float(parameter.double().abs().sum()) for parameter in network.parameters())}
 
 
-def trainer(
-    bundle: SceneBundle, folder: Path, config: TrainingConfig = CONFIG, weights: Path | None = None
-) -> Trainer:
-    dataset = SceneBundleDataset(
-        [bundle], config.sampling, config.augmentation, config.seed, config.schedule.steps
-    )
+def trainer(bundle: SceneBundle, folder: Path, config: TrainingConfig = CONFIG, weights: Path | None = None) -> Trainer:
+    source = BundleSource([bundle])
+    dataset = TrainingDataset(source, config.sampling, config.augmentation, config.seed, config.schedule.steps)
     return Trainer(config, dataset, folder, fingerprint, 3, "cpu", 0, weights)
 
 
@@ -65,7 +68,7 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 def assert_same_run(folder: Path, other: Path) -> None:
-    for name in (loop.LOG, loop.VALIDATION):
+    for name in (LOG, VALIDATION):
         assert rows(folder / name) == rows(other / name)
     states = [torch.load(run / CHECKPOINT, weights_only=True) for run in (folder, other)]
     assert states[0]["step"] == states[1]["step"] == STEPS
@@ -90,9 +93,9 @@ def whole_run(bundle: SceneBundle, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def test_the_run_directory_holds_logs_and_weights(whole_run):
-    assert [row["step"] for row in rows(whole_run / loop.LOG)] == ["2", "4", "6"]
-    assert [row["step"] for row in rows(whole_run / loop.VALIDATION)] == ["3", "6"]
-    assert all(np.isfinite(float(value)) for row in rows(whole_run / loop.LOG) for value in row.values())
+    assert [row["step"] for row in rows(whole_run / LOG)] == ["2", "4", "6"]
+    assert [row["step"] for row in rows(whole_run / VALIDATION)] == ["3", "6"]
+    assert all(np.isfinite(float(value)) for row in rows(whole_run / LOG) for value in row.values())
     network = load_network(whole_run / loop.WEIGHTS)
     assert network.config == TINY
     average = torch.load(whole_run / CHECKPOINT, weights_only=True)["average"]
@@ -134,8 +137,8 @@ def test_a_killed_run_goes_on_from_its_checkpoint(bundle, whole_run, tmp_path, m
     with pytest.raises(KeyboardInterrupt):
         trainer(bundle, tmp_path).run()
     monkeypatch.setattr(Trainer, "_train_step", original)
-    with open(tmp_path / loop.LOG, "a") as file:  # logged after the checkpoint, the last row torn
-        file.write("4," + ",".join("9" * (len(rows(tmp_path / loop.LOG)[0]))) + "\n5,0.1")
+    with open(tmp_path / LOG, "a") as file:  # logged after the checkpoint, the last row torn
+        file.write("4," + ",".join("9" * (len(rows(tmp_path / LOG)[0]))) + "\n5,0.1")
     (tmp_path / "checkpoint.partial").write_bytes(b"torn")
     again = trainer(bundle, tmp_path)
     assert again.step == 2
@@ -149,15 +152,15 @@ def test_a_finished_run_does_nothing_more(bundle, whole_run, tmp_path):
     assert_same_run(whole_run, tmp_path)
 
 
-def poisoned(bundle: SceneBundle, field: str) -> type[SceneBundleDataset]:
-    class Poisoned(SceneBundleDataset):
+def poisoned(bundle: SceneBundle, field: str) -> TrainingDataset:
+    class Poisoned(TrainingDataset):
         def __getitem__(self, step: int) -> dict[str, torch.Tensor]:
             batch = super().__getitem__(step)
             if step == 3:
                 batch[field][0, 0, 0] = float("nan")
             return batch
 
-    return Poisoned([bundle], CONFIG.sampling, CONFIG.augmentation, CONFIG.seed, STEPS)
+    return Poisoned(BundleSource([bundle]), CONFIG.sampling, CONFIG.augmentation, CONFIG.seed, STEPS)
 
 
 @pytest.mark.parametrize("field", ["correspondences", "attributes"])
@@ -198,9 +201,84 @@ def test_a_run_may_start_from_weights(bundle, tmp_path):
             assert torch.equal(mine, given)
 
 
+def test_options_newer_than_a_checkpoint_count_as_defaults(bundle, tmp_path):
+    trainer(bundle, tmp_path).run(stop_after=1)
+    state = torch.load(tmp_path / CHECKPOINT, weights_only=True)
+    values = json.loads(state["config"])
+    del values["validation"], values["sources"], values["schedule"]["divergence_factor"]
+    torch.save({**state, "config": json.dumps(values)}, tmp_path / CHECKPOINT)
+    assert trainer(bundle, tmp_path).step == 1
+    values["schedule"]["clip_norm"] = 9.0
+    torch.save({**state, "config": json.dumps(values)}, tmp_path / CHECKPOINT)
+    with pytest.raises(ConfigError, match=r"schedule\.clip_norm"):
+        trainer(bundle, tmp_path)
+
+
+def test_weights_are_written_whole_or_not_at_all(bundle, tmp_path, monkeypatch):
+    trainer(bundle, tmp_path).run(stop_after=2)
+    before = (tmp_path / loop.WEIGHTS).read_bytes()
+
+    def torn(network: MGCANet, path: Path, metadata: dict[str, str]) -> None:
+        path.write_bytes(b"torn")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(loop, "save_network", torn)
+    with pytest.raises(OSError, match="disk full"):
+        trainer(bundle, tmp_path).run()
+    assert (tmp_path / loop.WEIGHTS).read_bytes() == before
+
+
+def test_the_run_directory_tells_where_the_run_came_from(whole_run):
+    (origin,) = json.loads((whole_run / "origin.json").read_text())
+    assert origin["from_step"] == 0
+    assert origin["packages"]["torch"] == torch.__version__
+    assert set(origin) == {"from_step", "commit", "command", "packages", "machine"}
+    assert (whole_run / "validation.md").read_text().splitlines()[0] == "| step | weights |"
+
+
+def test_curves_are_drawn(whole_run):
+    cv2 = pytest.importorskip("cv2")
+    pytest.importorskip("matplotlib")
+    assert cv2.imread(str(whole_run / "curves.png")).shape[1] > 500
+
+
+def test_tensorboard_gets_the_same_figures(whole_run):
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    events = accumulator.EventAccumulator(str(whole_run / "tensorboard"))
+    events.Reload()
+    found = [(event.step, event.value) for event in events.Scalars("train/loss")]
+    expected = [(int(row["step"]), float(row["loss"])) for row in rows(whole_run / LOG)]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_a_growing_loss_is_seen_and_a_noisy_one_is_not():
+    rng = np.random.default_rng(0)
+    noisy = 2.0 * np.exp(rng.normal(0.0, 0.4, 2000)) + np.linspace(1, 0, 2000)
+    watch = LossWatch()
+    assert not any(watch.diverges(float(loss), 3.0) for loss in noisy)
+    assert not any(dataclasses.replace(watch).diverges(100.0, 0.0) for _ in range(300))
+    assert any(watch.diverges(20.0, 3.0) for _ in range(60))
+
+
+def test_a_diverging_run_stops_and_keeps_the_batch(bundle, tmp_path, monkeypatch):
+    monkeypatch.setattr(schedule, "SETTLED", 1)
+    growing = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, divergence_factor=1e-3))
+    with pytest.raises(DivergedError, match="step 0.*grown"):
+        trainer(bundle, tmp_path, growing).run()
+    assert torch.load(tmp_path / "diverged_0_0.pt", weights_only=True)["labels"].shape == (2, 32)
+
+
+def test_learning_rate_falls_in_steps():
+    config = ScheduleConfig(
+        kind="steps", steps=100, warmup_steps=10, learning_rate=1.0, milestones=(40, 80), factor=0.4
+    )
+    rates = [learning_rate(config, step) for step in (0, 9, 10, 39, 40, 79, 80, 99)]
+    np.testing.assert_allclose(rates, [0.1, 1.0, 1.0, 1.0, 0.4, 0.4, 0.16, 0.16])
+
+
 def test_learning_rate_warms_up_and_falls_to_its_fraction():
-    schedule = ScheduleConfig(steps=110, warmup_steps=10, learning_rate=1e-3, final_fraction=0.1)
-    rates = [learning_rate(schedule, step) for step in range(111)]
+    config = ScheduleConfig(steps=110, warmup_steps=10, learning_rate=1e-3, final_fraction=0.1)
+    rates = [learning_rate(config, step) for step in range(111)]
     np.testing.assert_allclose(rates[:10], np.arange(1, 11) * 1e-4)
     np.testing.assert_allclose([rates[10], rates[60], rates[110]], [1e-3, 0.55e-3, 1e-4])
     assert (np.diff(rates[10:]) < 0).all()
@@ -226,7 +304,7 @@ def test_the_average_follows_the_weights(bundle, tmp_path):
 def test_bf16_runs_on_the_cpu(bundle, tmp_path):
     config = dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, precision="bf16"))
     trainer(bundle, tmp_path, config).run(stop_after=2)
-    (row,) = rows(tmp_path / loop.LOG)
+    (row,) = rows(tmp_path / LOG)
     assert np.isfinite(float(row["loss"]))
 
 
@@ -265,9 +343,9 @@ def test_the_command_trains_and_resumes(tmp_path, capsys):
     command = ["--config", str(tmp_path / "run.toml"), "--data", str(data), "--run", str(tmp_path / "run")]
     command += ["--device", "cpu", "--workers", "0", "--validate-pairs", "1"]
     assert main([*command, "--stop-after", "1"]) == 0
-    assert not (tmp_path / "run" / loop.VALIDATION).exists()
+    assert not (tmp_path / "run" / VALIDATION).exists()
     assert main(command) == 0
-    assert [row["step"] for row in rows(tmp_path / "run" / loop.VALIDATION)] == ["2"]
+    assert [row["step"] for row in rows(tmp_path / "run" / VALIDATION)] == ["2"]
     assert load_network(tmp_path / "run" / loop.WEIGHTS).config == TINY
 
     (data / "yard.npz").unlink()

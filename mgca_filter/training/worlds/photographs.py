@@ -47,6 +47,14 @@ class PhotoFolder:
     def __len__(self) -> int:
         return len(self.paths)
 
+    def check(self, index: int) -> None:
+        """Read a photograph and forget it, so that a broken one is found before training starts.
+
+        Raises:
+            PhotoError: it cannot be used.
+        """
+        _read(self.paths[index])
+
     def pyramid(self, index: int) -> Pyramid:
         """Grey levels of a photograph at full, half, quarter … size.
 
@@ -56,15 +64,20 @@ class PhotoFolder:
         return _read_pyramid(self.paths[index])
 
 
-@lru_cache(maxsize=CACHED_PHOTOS)
-def _read_pyramid(path: Path) -> Pyramid:
+def _read(path: Path) -> NDArray[np.uint8]:
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None or min(image.shape) < 2**LEVELS:
         raise PhotoError(f"{path}: not a picture of at least {2**LEVELS} px that OpenCV can read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+@lru_cache(maxsize=CACHED_PHOTOS)
+def _read_pyramid(path: Path) -> Pyramid:
+    image = _read(path)
     scale = LONG_SIDE_PX / max(image.shape)
     if scale < 1.0:
-        image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    levels = [np.asarray(image, dtype=np.uint8)]
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    levels = [image]
     for _ in range(LEVELS - 1):
         last = levels[-1]
         even = last[: last.shape[0] // 2 * 2, : last.shape[1] // 2 * 2]

@@ -1,0 +1,109 @@
+"""What a run leaves in its directory besides weights: config, origin, curves as CSV, TensorBoard and PNG."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..evaluation.environment import library_versions, machine_description, source_commit
+from .config import TrainingConfig
+from .curves import draw_curves
+
+LOG, VALIDATION, TABLE = "train.csv", "validation.csv", "validation.md"
+
+
+class RunDirectory:
+    """The files of a run that tell how it went.
+
+    ``config.json``; ``origin.json``: commit, versions, machine and command of every start; ``train.csv``,
+    ``validation.csv`` and ``validation.md``; ``curves.png`` where matplotlib and ``tensorboard/`` where TensorBoard is
+    installed.
+
+    Args:
+        folder: made if it is not there.
+        config: the run.
+        step: steps done; rows of a killed run beyond them are forgotten.
+    """
+
+    def __init__(self, folder: Path, config: TrainingConfig, step: int) -> None:
+        self.folder = folder
+        for name in (LOG, VALIDATION):
+            _drop_rows_after(folder / name, step)
+        (folder / "config.json").write_text(json.dumps(config.to_dict(), indent=2), encoding="utf-8")
+        self._add_origin(step)
+        self._tensorboard = _open_tensorboard(folder / "tensorboard", step)
+
+    def log(self, step: int, figures: dict[str, float]) -> None:
+        """Add a row of training figures."""
+        self._append(LOG, "train", step, figures)
+
+    def add_validation(self, step: int, figures: dict[str, float]) -> None:
+        """Add a row of validation figures, and draw table and curves anew."""
+        self._append(VALIDATION, "validation", step, figures)
+        rows = read_rows(self.folder / VALIDATION)
+        lines = [list(rows[0]), ["---:"] * len(rows[0])]
+        lines += [[row["step"], *(f"{float(v):.1f}" for k, v in row.items() if k != "step")] for row in rows]
+        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        (self.folder / TABLE).write_text(table + "\n", encoding="utf-8")
+        draw_curves(self.folder / "curves.png", read_rows(self.folder / LOG), rows)
+
+    def _append(self, name: str, group: str, step: int, figures: dict[str, float]) -> None:
+        path = self.folder / name
+        new = not path.is_file()
+        row: dict[str, Any] = {"step": step, **figures}
+        with open(path, "a", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, list(row))
+            if new:
+                writer.writeheader()
+            writer.writerow(row)
+        if self._tensorboard is not None:
+            for key, value in figures.items():
+                self._tensorboard.add_scalar(f"{group}/{key}", value, step)
+            self._tensorboard.flush()
+
+    def _add_origin(self, step: int) -> None:
+        path = self.folder / "origin.json"
+        starts = json.loads(path.read_text(encoding="utf-8")) if path.is_file() and step else []
+        origin = {
+            "from_step": step,
+            "commit": source_commit(),
+            "command": sys.argv,
+            "packages": {**library_versions(), "torch": torch.__version__},
+            "machine": machine_description(),
+        }
+        path.write_text(json.dumps([*starts, origin], indent=2), encoding="utf-8")
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file with a header; none where the file is not there."""
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _open_tensorboard(folder: Path, step: int) -> Any:
+    """A writer that forgets what was written beyond ``step``, or None without TensorBoard."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        return None
+    return SummaryWriter(str(folder), purge_step=step + 1)
+
+
+def _drop_rows_after(path: Path, step: int) -> None:
+    """Forget what a killed run logged beyond its last checkpoint, and a last row that it left unfinished."""
+    if not path.is_file():
+        return
+    header, *rows = path.read_text(encoding="utf-8").splitlines() or [""]
+    if step == 0 or not header:
+        path.unlink()
+        return
+    whole = [row for row in rows if row.count(",") == header.count(",")]
+    kept = [row for row in whole if int(row.split(",", 1)[0]) <= step]
+    path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
