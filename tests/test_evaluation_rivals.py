@@ -203,7 +203,7 @@ def clocked(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_iterations_are_found_that_take_our_time(target_ms: float, per_thousand: float, clocked: Any, pair: ScenePair):
     like = clocked(lambda iterations: per_thousand * iterations / 1000, target_ms)
     (match,) = match_times(["NN + MAGSAC 1 px"], like, [pair])
-    assert match.reached_ms == pytest.approx(target_ms, rel=0.45)
+    assert match.reached_ms == pytest.approx(target_ms, rel=0.2)
     assert match.reached_ms == pytest.approx(per_thousand * match.iterations / 1000)
     assert match.method == f"NN + MAGSAC 1 px {match.iterations} iterations"
     assert (match.like, match.target_ms) == ("ours", pytest.approx(target_ms))
@@ -222,8 +222,10 @@ def test_the_iterations_found_are_kept(clocked: Any, pair: ScenePair, tmp_path: 
     first = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: i / 1000, 50.0), [pair], tmp_path)
     again = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
     assert again == first
+    threads = cv2.getNumThreads()
     other = match_times(["NN + RANSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
     assert other[0].target_ms == pytest.approx(70.0)
+    assert cv2.getNumThreads() == threads
 
 
 def test_command_adds_time_matched_rows(

@@ -128,10 +128,12 @@ def run(options: argparse.Namespace) -> None:
     methods, not_installed = _installed([parse_method(name, options.model) for name in _expand(options.methods)])
     time_matched: list[TimeMatch] = []
     if options.time_matched is not None:
+        rivals, lacking = _installed([parse_method(name) for name in TIME_MATCHED_ROWS])
         like = parse_method(options.time_matched, options.model)
-        sample = sample_pairs(selections, SAMPLE_PAIRS)
-        time_matched = match_times(TIME_MATCHED_ROWS, like, sample, store.folder)
+        names = [rival.name for rival in rivals]
+        time_matched = match_times(names, like, sample_pairs(selections, SAMPLE_PAIRS), store.folder)
         methods += [parse_method(match.method) for match in time_matched]
+        not_installed += lacking
     results = predict(
         methods, selections, seeds=options.seeds, workers=options.workers, store=store, progress=not options.quiet
     )

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..scene_bundle import ScenePair
@@ -18,6 +19,7 @@ from .registry import parse_method
 
 SAMPLE_PAIRS = 60
 MIN_ITERATIONS, MAX_ITERATIONS = 50, 1 << 20
+BISECTIONS = 2
 STALL_ITERATIONS = 16_000  # below it, what every pair costs anyway hides the iterations
 STALLED = 1.03
 """Twice the iterations take at least this times as long, unless the estimator stops early whatever it is allowed."""
@@ -56,8 +58,13 @@ def match_times(
     path = None if folder is None else folder / f"time-matched.{_digest(names, like, pairs)}.json"
     if path is not None and path.exists():
         return [TimeMatch(**fields) for fields in json.loads(path.read_text())]
-    target_ms = _median_ms(like, pairs)
-    matches = [_search(name, like.name, target_ms, pairs) for name in names]
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        target_ms = _median_ms(like, pairs)
+        matches = [_search(name, like.name, target_ms, pairs) for name in names]
+    finally:
+        cv2.setNumThreads(threads)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps([asdict(match) for match in matches], indent=1))
@@ -87,11 +94,12 @@ def _search(name: str, like: str, target_ms: float, pairs: Sequence[ScenePair]) 
         iterations = following
         if stalled and iterations >= STALL_ITERATIONS:
             break
-    below = [n for n in tried if tried[n] < target_ms]
-    above = [n for n in tried if tried[n] >= target_ms]
-    if below and above:
-        middle = round(float(np.sqrt(max(below) * min(above))))
-        tried[middle] = measure(middle)
+    for _ in range(BISECTIONS):
+        below = [n for n in tried if tried[n] < target_ms]
+        above = [n for n in tried if tried[n] >= target_ms]
+        if below and above:
+            middle = round(float(np.sqrt(max(below) * min(above))))
+            tried[middle] = measure(middle)
     # Times within a per cent of each other count as the same: then the fewest iterations do.
     best = min(tried, key=lambda n: (round(abs(tried[n] - target_ms) / target_ms, 2), n))
     return TimeMatch(f"{name} {best} iterations", best, tried[best], like, target_ms)
