@@ -65,9 +65,10 @@ class ColmapSource:
         R = two.R @ one.R.T
         t = two.t - R @ one.t
         check_pose(R, t, f"{self.path}: {one.name} and {two.name}")
-        return match_views(self.scene, index, self._view(one), self._view(two), R, t)
+        return match_views(self.scene, index, self.view(one), self.view(two), R, t)
 
-    def _view(self, photo: _Photo) -> View:
+    def view(self, photo: _Photo) -> View:
+        """A photograph's features, with their distortion removed."""
         features = detect(self.image_folder / photo.name)
         if features.size != photo.size:
             raise DatasetError(
@@ -118,7 +119,7 @@ def open_reconstruction(path: Path, images: Path | None = None) -> list[ColmapSo
     image_folder = path / "images" if images is None else images
     registered = sorted((reconstruction.image(i) for i in reconstruction.reg_image_ids()), key=lambda image: image.name)
     photos = tuple(_photo(image) for image in registered)
-    pairs = covisible_pairs([_observed_points(image) for image in registered])
+    pairs = covisible_pairs([observed_points(image) for image in registered])
     check_folder(image_folder, [photo.name for photo in photos], str(folder))
     files = [folder / f"{part}{end}" for part in ("cameras", "images", "points3D") for end in (".bin", ".txt")]
     digest = digest_files([*files, *(image_folder / photo.name for photo in photos)], FEATURE_SETTINGS)
@@ -133,7 +134,8 @@ def _photo(image: Any) -> _Photo:
     return _Photo(image.name, camera.model.name, size, parameters, R, np.array(pose.translation, dtype=np.float64))
 
 
-def _observed_points(image: Any) -> NDArray[np.int64]:
+def observed_points(image: Any) -> NDArray[np.int64]:
+    """Ascending ids of the reconstructed points that a ``pycolmap.Image`` sees."""
     return np.unique(np.array([point.point3D_id for point in image.get_observation_points2D()], dtype=np.int64))
 
 
