@@ -13,7 +13,7 @@ from mgca_filter.evaluation import stress
 from mgca_filter.evaluation.hostile_inputs import FORMS, KINDS
 from mgca_filter.evaluation.promises import broken_essential, broken_promises, broken_twin_answer
 
-ANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+ANY = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 COUNTS = st.integers(0, 40) | st.integers(0, 3000)
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -41,7 +41,7 @@ def test_any_mixture_by_any_method(model_file, seed: int, count: int, method: st
     assert [b for b in broken_promises(result, count) if "without a model" not in b or method != "none"] == []
 
 
-@settings(ANY, max_examples=40)
+@settings(ANY, max_examples=20)
 @given(SEEDS, COUNTS, st.sampled_from(sorted(KINDS)))
 def test_any_points_through_the_twins(seed: int, count: int, kind: str) -> None:
     points1, points2 = KINDS[kind](np.random.default_rng(seed), count)

@@ -21,6 +21,9 @@ CPU_PROVIDER = "CPUExecutionProvider"
 # What ONNX Runtime raises for a file that is damaged or no ONNX model; anything else is the runtime's fault.
 _FILE_ERRORS = ("InvalidProtobuf", "InvalidGraph", "InvalidArgument", "NoModel", "NoSuchFile")
 _LOG_ERRORS_ONLY = 3
+# The product that this fusion makes of a mean over the matches rounds by the number of threads, and what a rounding
+# moves across a nearest-neighbour choice moves logits by tenths. Without it all numbers of threads give the same bits.
+_DISABLED_OPTIMIZERS = ["MatMulScaleFusion"]
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"
 
 
@@ -86,7 +89,9 @@ def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnx
     reason = f"this ONNX Runtime has no {', '.join(missing)}" if missing else ""
     if usable and usable != [CPU_PROVIDER]:
         try:
-            session = runtime.InferenceSession(str(path), options, providers=usable)
+            session = runtime.InferenceSession(
+                str(path), options, providers=usable, disabled_optimizers=_DISABLED_OPTIMIZERS
+            )
             lost = [name for name in names if name not in missing and name not in session.get_providers()]
             reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
             if reason:
@@ -97,7 +102,9 @@ def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnx
     if reason:
         _warn_about_provider(reason)
     try:
-        return runtime.InferenceSession(str(path), options, providers=[CPU_PROVIDER])
+        return runtime.InferenceSession(
+            str(path), options, providers=[CPU_PROVIDER], disabled_optimizers=_DISABLED_OPTIMIZERS
+        )
     except Exception as error:
         if type(error).__name__ in _FILE_ERRORS:
             raise ModelError(f"{path}: not a readable ONNX model, truncated or damaged ({error})") from error
