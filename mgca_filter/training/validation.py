@@ -1,8 +1,9 @@
-"""Quick look at a network on real pairs while it trains; the evaluation package has the last word."""
+"""How a network does on real pairs, without the product around it; the evaluation package has the last word."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..evaluation.metrics import (
     FAILURE_DEG,
     TRUE_INLIER_DISTANCE_SQUARED,
+    area_under_recall,
     mean_average_precision,
     precision_recall_f,
 )
@@ -21,6 +23,7 @@ from ..network import MGCANet
 from ..ranking import RankedMatches, match_order
 from ..robust_fit import estimate_pose, pose_from_essential
 from ..scene_bundle import SceneBundle, ScenePair
+from .input_kinds import InputList, raw
 from .sources.bundles import is_held_out
 
 
@@ -50,38 +53,69 @@ def held_out_pairs(bundles: Sequence[SceneBundle], holdout_every: int, per_scene
     return chosen
 
 
-def quick_validation(network: MGCANet, pairs: Iterable[ScenePair]) -> dict[str, float]:
-    """Mean precision and recall at logit > 0, mAP@5 and mAP@20 (percent) of the robust fit and of E alone.
+@dataclass(frozen=True)
+class PairFigures:
+    """A network on one pair and one kind of input of M matches.
 
-    Precision and recall count all raw matches; pairs, not scenes, are averaged.
+    Attributes:
+        logits: (M,) float64; matches that never enter the network have the prior's, or −inf without a prior.
+        truth: (M,) bool, within 1e-4 of the true epipolar geometry.
+        fit_deg, own_deg: pose error of the robust fit, and of the network's essential matrix alone.
     """
+
+    logits: NDArray[np.float64]
+    truth: NDArray[np.bool_]
+    fit_deg: float
+    own_deg: float
+
+    def at(self, threshold: float) -> tuple[float, float, float]:
+        """Precision, recall and F-measure of the matches whose logit is above ``threshold``."""
+        return precision_recall_f(self.logits > threshold, self.truth)
+
+
+def quick_validation(network: MGCANet, pairs: Iterable[ScenePair]) -> dict[str, float]:
+    """Figures of a network on raw matches, in per cent: see :func:`summarize`."""
     network.eval()
-    rows = [_evaluate_pair(network, pair) for pair in pairs]
-    precision, recall, fit, own = np.array(rows, dtype=np.float64).T
-    result = {"precision": precision.mean(), "recall": recall.mean()}
-    for name, errors in (("fit", fit), ("essential", own)):
+    return summarize([evaluate_pair(network, pair) for pair in pairs])
+
+
+def summarize(figures: Sequence[PairFigures]) -> dict[str, float]:
+    """Mean precision, recall and F at logit > 0, mAP@5, mAP@20 and AUC@5 of the robust fit and of E alone, per cent.
+
+    Precision and recall count all matches of the input; pairs, not scenes, are averaged.
+    """
+    precision, recall, f_measure = np.mean([pair.at(0.0) for pair in figures], axis=0)
+    result = {"precision": precision, "recall": recall, "F": f_measure}
+    for name, errors in (("fit", [p.fit_deg for p in figures]), ("essential", [p.own_deg for p in figures])):
         for limit in (5, 20):
             result[f"{name}_mAP@{limit}"] = mean_average_precision(errors, limit)
+        result[f"{name}_AUC@5"] = area_under_recall(errors, 5.0)
     return {name: 100.0 * float(value) for name, value in result.items()}
 
 
 @torch.inference_mode()
-def _evaluate_pair(network: MGCANet, pair: ScenePair) -> tuple[float, float, float, float]:
-    encoded = pair.attributes.encode(len(pair.points1))
+def evaluate_pair(network: MGCANet, pair: ScenePair, given: InputList | None = None) -> PairFigures:
+    """Run a network on the matches of a pair that ``given`` names (None = all, with all that is known of them)."""
+    taken, attributes = raw(pair) if given is None else given
+    correspondences, encoded = pair.correspondences[taken], attributes.encode(len(taken))
+    truth = symmetric_epipolar_distance_squared(correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
+    if len(taken) == 0:
+        return PairFigures(np.zeros(0), truth, FAILURE_DEG, FAILURE_DEG)
+    device = next(network.parameters()).device
     rows = np.flatnonzero(candidate_mask(encoded))
-    x, attributes = pair.correspondences[rows], encoded[rows]
-    output = network(torch.from_numpy(x.astype(np.float32))[None], torch.from_numpy(attributes)[None])
-    logits = output.logits[0].numpy()
-    truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
-    accepted = np.zeros(len(truth), dtype=bool)
-    accepted[rows] = logits > 0
-    precision, recall, _ = precision_recall_f(accepted, truth)
-    scores = 1.0 / (1.0 + np.exp(-np.clip(logits, -60.0, 60.0)))
-    order = match_order(scores, attributes[:, 0], attributes[:, 5] > 0)
-    fit = estimate_pose(RankedMatches.of(x, order, scores, logits), mean_focal_length(pair.K1, pair.K2))
-    best = np.argsort(-logits)[: max(len(logits) // 10, 8)]
-    own = pose_from_essential(output.essential[0].numpy().astype(np.float64), x[best])
-    return precision, recall, _error(fit, pair), _error(own, pair)
+    x, known = correspondences[rows], torch.from_numpy(encoded).to(device)
+    output = network(torch.from_numpy(x.astype(np.float32))[None].to(device), known[rows][None])
+    logits = np.full(len(taken), -np.inf)
+    if network.prior is not None:
+        logits = network.prior(known).double().cpu().numpy()
+    entered = output.logits[0].double().cpu().numpy()
+    logits[rows] = entered
+    scores = 1.0 / (1.0 + np.exp(-np.clip(entered, -60.0, 60.0)))
+    order = match_order(scores, encoded[rows, 0], encoded[rows, 5] > 0)
+    fit = estimate_pose(RankedMatches.of(x, order, scores, entered), mean_focal_length(pair.K1, pair.K2))
+    best = np.argsort(-entered)[: max(len(entered) // 10, 8)]
+    own = pose_from_essential(output.essential[0].double().cpu().numpy(), x[best])
+    return PairFigures(logits, truth, _error(fit, pair), _error(own, pair))
 
 
 def _error(pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None, pair: ScenePair) -> float:

@@ -312,7 +312,8 @@ def test_quick_validation_gives_percentages(bundle):
     pairs = select_pairs([bundle], 2)
     assert [pair.index for pair in pairs] == [0, 2]
     figures = quick_validation(tiny_network(), pairs)
-    assert set(figures) == {"precision", "recall", "fit_mAP@5", "fit_mAP@20", "essential_mAP@5", "essential_mAP@20"}
+    poses = {f"{name}_{figure}" for name in ("fit", "essential") for figure in ("mAP@5", "mAP@20", "AUC@5")}
+    assert set(figures) == {"precision", "recall", "F"} | poses
     assert all(0.0 <= value <= 100.0 for value in figures.values())
 
 
