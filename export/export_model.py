@@ -13,6 +13,7 @@ from pathlib import Path
 from parity import check_parity, format_parity
 
 import mgca_filter
+from mgca_filter.backends.checksums import SUMS_NAME, record_checksums
 from mgca_filter.calibration import Calibration
 from mgca_filter.network import load_network
 from mgca_filter.onnx_export import ModelDescription, export_model, halve_weights
@@ -52,6 +53,8 @@ def main() -> int:
         halve_weights(onnx_path, half_path)
         print(format_parity(check_parity(half_path, torch_path)))
         print(f"{half_path} ({half_path.stat().st_size / 2**20:.2f} MiB)")
+    if (options.folder / SUMS_NAME).exists():
+        record_checksums(options.folder)
     return 0 if all(row.passed for row in rows) else 1
 
 

@@ -19,6 +19,7 @@ from . import __version__
 from .cli_output import MatchReport, picture, summary, to_json, write_npz
 from .comparison import BaselineFit, comparison_table, fit_baselines
 from .errors import MgcaFilterError
+from .image_header import MAX_PIXELS, promised_size
 from .image_matching import match_images
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
@@ -118,6 +119,9 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         raise UsageError(f"{path}: {error.strerror or error}") from error
     if not data:
         raise UsageError(f"{path}: the file is empty")
+    width, height = promised_size(data) or (0, 0)
+    if width * height > MAX_PIXELS:
+        raise UsageError(f"{path}: its header promises {width} x {height} pixels, at most {MAX_PIXELS} are read")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except (cv2.error, MemoryError) as error:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,8 +13,11 @@ import numpy as np
 from ..calibration import AttributePrior, Calibration
 from ..correspondences import ATTRIBUTE_COUNT
 from ..errors import ModelError
+from .checksums import check_checksum, sha256_of
 
 CONTRACT_VERSION = "1"
+# The largest preset takes 20 MB; more than this is another file, and is not read into memory.
+MAX_MODEL_BYTES = 2**29
 _TEXT_KEYS = (
     "name",
     "version",
@@ -104,7 +106,7 @@ def parse_metadata(properties: Mapping[str, str], path: Path) -> ModelMetadata:
         candidate_max_ratio=max_ratio,
         candidate_min_count=min_count,
         prior=prior,
-        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        sha256=sha256_of(path),
     )
 
 
@@ -127,8 +129,12 @@ def _parse_prior(values: Mapping[str, Any]) -> AttributePrior:
 
 
 def check_model_file(path: Path) -> None:
-    """Raise ModelError where ``path`` is not a readable, non-empty file."""
+    """Raise ModelError where ``path`` is no file of a model's size, or a shipped model that was damaged."""
     if not path.is_file():
         raise ModelError(f"{path}: model file not found")
-    if path.stat().st_size == 0:
+    size = path.stat().st_size
+    if size == 0:
         raise ModelError(f"{path}: model file is empty")
+    if size > MAX_MODEL_BYTES:
+        raise ModelError(f"{path}: {size} bytes is no model of this package, at most {MAX_MODEL_BYTES} are read")
+    check_checksum(path)

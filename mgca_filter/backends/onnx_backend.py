@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Union
 from ..errors import BackendError, ModelError
 from .base import OUTPUT_NAMES, Float32Array, check_input, check_names
 from .metadata import ModelMetadata, check_model_file, parse_metadata
+from .onnx_file import read_onnx_file
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -47,14 +48,14 @@ class OnnxBackend:
     def __init__(self, path: Path, providers: Providers | None = None) -> None:
         self._path, self._providers = path, providers
         check_model_file(path)
+        file = read_onnx_file(path)
+        check_names(path, file.inputs, file.outputs)
+        self._metadata = parse_metadata(file.properties, path)
         try:
             import onnxruntime
         except Exception as error:  # a broken installation raises whatever its loader raises
             raise BackendError(f"ONNX Runtime cannot be imported ({error})") from error
         self._session = _open_session(onnxruntime, path, providers)
-        check_names(path, [i.name for i in self._session.get_inputs()], [o.name for o in self._session.get_outputs()])
-        properties = self._session.get_modelmeta().custom_metadata_map
-        self._metadata = parse_metadata(properties, path)
 
     @property
     def metadata(self) -> ModelMetadata:
