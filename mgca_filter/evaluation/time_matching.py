@@ -20,6 +20,7 @@ from .registry import parse_method
 SAMPLE_PAIRS = 60
 MIN_ITERATIONS, MAX_ITERATIONS = 50, 1 << 20
 BISECTIONS = 2
+TIE = 0.05  # of the target: times closer to each other than this are the same to a noisy clock
 STALL_ITERATIONS = 16_000  # below it, what every pair costs anyway hides the iterations
 STALLED = 1.03
 """Twice the iterations take at least this times as long, unless the estimator stops early whatever it is allowed."""
@@ -100,8 +101,13 @@ def _search(name: str, like: str, target_ms: float, pairs: Sequence[ScenePair]) 
         if below and above:
             middle = round(float(np.sqrt(max(below) * min(above))))
             tried[middle] = measure(middle)
-    # Times within a per cent of each other count as the same: then the fewest iterations do.
-    best = min(tried, key=lambda n: (round(abs(tried[n] - target_ms) / target_ms, 2), n))
+
+    def distance(iterations: int) -> tuple[float, int]:
+        # Of times a few per cent apart, the most iterations that keep below ours, the fewest of those that do not.
+        apart = (tried[iterations] - target_ms) / target_ms
+        return round(abs(apart) / TIE) * TIE, -iterations if apart <= 0 else iterations
+
+    best = min(tried, key=distance)
     return TimeMatch(f"{name} {best} iterations", best, tried[best], like, target_ms)
 
 
