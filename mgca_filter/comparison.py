@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from .correspondences import mean_focal_length
 from .epipolar import rotation_error_deg, sampson_distance
 from .intrinsics import resolve_intrinsics
+from .ranking import RankedMatches
 from .result import FilterResult
-from .robust_fit import RobustFitOptions, estimate_model
+from .robust_fit import SINGLE_START, RobustFitOptions, estimate_model
 
 BASELINES = {"RANSAC": "ransac", "MAGSAC": "magsac"}
 
@@ -68,12 +69,11 @@ def fit_baselines(
     fits = []
     for name, method in BASELINES.items():
         options = RobustFitOptions(
-            method=method, threshold_px=threshold_px, confidence=0.999, seed=seed, refine=False
+            method=method, threshold_px=threshold_px, confidence=0.999, seed=seed, starts=SINGLE_START, refine=False
         )
         start = time.perf_counter()
-        model = estimate_model(
-            correspondences, np.arange(len(correspondences)), focal_px, options, calibrated=not camera1.guessed
-        )
+        matches = RankedMatches.of(correspondences, np.arange(len(correspondences)))
+        model = estimate_model(matches, focal_px, options, calibrated=not camera1.guessed)
         fit_ms = 1e3 * (time.perf_counter() - start)
         if model is None:
             fits.append(BaselineFit(name, np.zeros(len(points1), bool), None, None, None, fit_ms))

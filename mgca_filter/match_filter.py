@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from .backends import BACKENDS, Providers, shared_backend
 from .calibration import largest_set_of_precision
 from .correspondences import MatchAttributes
+from .estimators import METHODS
 from .option_checks import check_choice, check_integer, check_number, check_path, check_providers
 from .pair_input import MatchPair, PairInput, prepare_pair
+from .ranking import RankedMatches, match_order
 from .result import FilterResult, Status
-from .robust_fit import METHODS, MIN_MATCHES, RobustFitOptions, estimate_model, match_order
-from .scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_for_fit, select_network_input
+from .robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
+from .scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_network_input
 from .verdict import Verdict, count_distinct, judge
 
-# With fewer accepted matches than this, the best-scored ones fill up what the robust fit sees.
-MIN_FIT_MATCHES = 32
 _BATCH_PAIRS = 8
 
 
@@ -142,15 +142,11 @@ class MatchFilter:
         if self.method == "none":
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
-            rows = select_for_fit(logits, job.sent, metadata.decision_threshold, MIN_FIT_MATCHES)
-            known = pair.attributes[rows, 5] > 0
-            order = rows[match_order(scores[rows], pair.attributes[rows, 0], known)]
-            model = estimate_model(
-                pair.correspondences, order, pair.focal_px, self.fit_options, calibrated=pair.calibrated
-            )
+            ranked = self._rank(pair, job.sent, logits, scores)
+            model = estimate_model(ranked, pair.focal_px, self.fit_options, calibrated=pair.calibrated)
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
-            verdict = judge(pair, model, order, self.threshold, self.fit_options)
+            verdict = judge(pair, model, ranked, self.threshold, self.fit_options)
             if self.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
@@ -168,9 +164,19 @@ class MatchFilter:
                 **self._describe(job),
                 "logits": logits,
                 "fitted_essential": None if model is None else model.E,
+                "origin": None if model is None else model.origin,
                 **verdict.info,
             },
         )
+
+    def _rank(
+        self, pair: PairInput, sent: NetworkInput, logits: NDArray[np.float32], scores: NDArray[np.float32]
+    ) -> RankedMatches:
+        """What the network saw, in the order in which the robust fit draws."""
+        margins = logits - self._backend.metadata.decision_threshold
+        rows = sent.rows
+        order = rows[match_order(margins[rows], pair.attributes[rows, 0], pair.attributes[rows, 5] > 0)]
+        return RankedMatches.of(pair.correspondences, order, scores, margins)
 
     def _keep_by_scores(self, pair: PairInput, scores: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Mask (M,) that asks the network alone."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import cross_matrix, homogeneous, sampson_distance, triangulated_depths
+from .epipolar import cross_matrix, homogeneous, sampson_distance
 
 Array = NDArray[np.float64]
 
@@ -55,15 +55,9 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
     return R, t
 
 
-def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float, in_front: bool = False) -> float:
-    """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises.
-
-    With ``in_front`` a match that triangulates behind a camera counts as cut off.
-    """
+def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float) -> float:
+    """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises."""
     distance = np.minimum(sampson_distance(correspondences, cross_matrix(t) @ R), threshold)
-    if in_front:
-        depth1, depth2 = triangulated_depths(correspondences, R, t)
-        distance = np.where((depth1 > 0) & (depth2 > 0), distance, threshold)
     return float(np.sum(distance**2))
 
 

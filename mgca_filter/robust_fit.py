@@ -1,4 +1,4 @@
-"""Robust fit of the two-view model to scored matches: with ``homography.py`` the only caller of OpenCV's estimators.
+"""Robust fit of the two-view model to scored matches: several starts, refined, and the choice between them.
 
 All points are on the normalised image planes and thresholds come in pixels with the mean focal length that
 converts them. With intrinsics that can be trusted the model is an essential matrix; with guessed ones it is a
@@ -7,28 +7,45 @@ fundamental matrix, estimated in the same coordinates because they condition it 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from .epipolar import essential_from_pose, project_to_essential, sampson_distance
-from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, poses_from_homography, usac_params
-from .pose_refinement import refine_pose, truncated_cost
+from .estimators import EstimatorOptions, fit_epipolar
+from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, poses_from_homography
+from .pose_refinement import refine_pose
+from .ranking import RankedMatches
 
 Array = NDArray[np.float64]
 
-METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
 MIN_MATCHES = 8
-# A pose from the dominant plane is worth refining when it starts below this multiple of the cost to beat.
-RIVAL_COST_FACTOR = 1.5
-_POSELIB_MIN_ITERATIONS = 1000
-# Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
-_find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
+# A pose from the dominant plane is worth refining when it starts with this share of the support to beat.
+RIVAL_SUPPORT_SHARE = 0.5
 # recoverPose drops points farther than 50 baselines unless told otherwise.
 _ANY_DISTANCE = 1e9
+
+
+@dataclass(frozen=True)
+class Start:
+    """One run of the estimator.
+
+    Attributes:
+        margin: it sees the matches whose logit lies above the decision threshold by more than this.
+        threshold_factor: its threshold in multiples of the fit's.
+    """
+
+    margin: float = 0.0
+    threshold_factor: float = 1.0
+
+
+# Estimators stop at the first model that looks good enough and miss better ones; what they see decides which they
+# meet. Four views of the matches, and the choice by support, find most of what any one of them would.
+STARTS = (Start(0.0, 2.0), Start(-1.0, 1.0), Start(-1.0, 2.0), Start(-2.0, 1.0))
+SINGLE_START = (Start(),)
 
 
 @dataclass(frozen=True)
@@ -39,10 +56,11 @@ class RobustFitOptions:
         method: ``"prosac"``, ``"magsac"``, ``"ransac"`` or ``"poselib"``; PROSAC and PoseLib use the order.
         threshold_px: Sampson distance that the estimator takes for an inlier, pixels.
         confidence: probability that a sample without outliers was drawn.
-        max_iterations: largest number of samples.
+        max_iterations: largest number of samples of a start.
         seed: of the estimator's random numbers.
-        refine: finish with least squares on the pose, from this model and from the dominant plane's.
-        refine_threshold_px: where the refinement cuts the error off, pixels.
+        starts: runs of the estimator, of which the best-supported model is kept.
+        refine: finish with least squares on the pose, from these models and from the dominant plane's.
+        refine_threshold_px: where refinement and support cut the error off, pixels.
     """
 
     method: str = "prosac"
@@ -50,8 +68,14 @@ class RobustFitOptions:
     confidence: float = 0.9999
     max_iterations: int = 5000
     seed: int = 0
+    starts: tuple[Start, ...] = STARTS
     refine: bool = True
     refine_threshold_px: float = 1.0
+
+    def estimator(self, index: int) -> EstimatorOptions:
+        """What start number ``index`` tells the estimator; each draws other samples."""
+        threshold_px = self.starts[index].threshold_factor * self.threshold_px
+        return EstimatorOptions(self.method, threshold_px, self.confidence, self.max_iterations, self.seed + index)
 
 
 @dataclass(frozen=True)
@@ -62,39 +86,38 @@ class TwoViewModel:
         M: (3, 3) of unit Frobenius norm, ``x2^T M x1 = 0``: the essential matrix, or, with guessed intrinsics,
             the fundamental matrix expressed in normalised coordinates.
         E: (3, 3) essential matrix of unit Frobenius norm. R: (3, 3) rotation. t: (3,) unit norm.
+        origin: where it was found: ``"start 1"``, ``"start 2"``, … or ``"plane"``.
     """
 
     M: Array
     E: Array
     R: Array
     t: Array
+    origin: str
 
 
-def match_order(
-    scores: NDArray[np.float32], ratio: NDArray[np.float32], ratio_known: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """Rows of the matches (N,), most promising first: the order in which PROSAC draws.
+@dataclass(frozen=True)
+class _Pose:
+    """A pose, where it was found and how well it is supported."""
 
-    Saturated scores order badly among themselves; the descriptor ratio, where it is known, tells them apart.
-    """
-    quality = scores.astype(np.float64) * np.where(ratio_known, 1.2 - ratio.astype(np.float64), 1.0)
-    return np.argsort(-quality, kind="stable")
+    R: Array
+    t: Array
+    origin: str
+    support: float
 
 
 def estimate_model(
-    correspondences: Array,
-    order: NDArray[np.intp],
+    matches: RankedMatches,
     focal_px: float,
     options: RobustFitOptions = RobustFitOptions(),
     calibrated: bool = True,
 ) -> TwoViewModel | None:
-    """Fit the two-view model to the matches that ``order`` names, best first.
+    """Fit the two-view model to ranked matches.
 
     Args:
-        correspondences: (N, 4) on the normalised image planes, finite.
-        order: (K,) rows of ``correspondences`` to fit to, the most promising first.
+        matches: what may be fitted to.
         focal_px: mean focal length, pixels: converts the thresholds.
-        options: method, thresholds, seed.
+        options: method, thresholds, starts, seed.
         calibrated: the intrinsics can be trusted: estimate E with five points; else F with seven.
 
     Returns:
@@ -103,58 +126,78 @@ def estimate_model(
     Raises:
         ImportError: ``method="poselib"`` without PoseLib.
     """
-    rows = np.ascontiguousarray(correspondences[order], dtype=np.float64)
-    rows = rows[_first_of_equals(rows)]
-    if len(rows) < MIN_MATCHES:
+    if len(matches.correspondences) < MIN_MATCHES:
         return None
-    if options.method == "poselib":
-        M = _fit_poselib(rows, focal_px, options, calibrated)
-    else:
-        M = _fit_opencv(rows, focal_px, options, calibrated)
-    if M is None:
-        return None
-    near = sampson_distance(rows, M) < options.refine_threshold_px / focal_px
-    E = project_to_essential(M)
-    pose = pose_from_essential(E, rows[near])
-    if pose is None:
-        return None
-    R, t = pose
+    found = []
+    for index, start in enumerate(options.starts):
+        seen = matches.above(start.margin).correspondences
+        M = fit_epipolar(seen, focal_px, options.estimator(index), calibrated)
+        if M is not None:
+            found.append((M, index))
     if calibrated:
-        if options.refine:
-            R, t = _refine_best_start(rows, R, t, focal_px, options)
-        E = essential_from_pose(R, t)
-        M = E
-    return TwoViewModel(M=M, E=E, R=R, t=t)
+        return _best_calibrated(matches, found, focal_px, options)
+    return _best_uncalibrated(matches, found, focal_px, options)
 
 
-def _refine_best_start(
-    rows: Array, R: Array, t: Array, focal_px: float, options: RobustFitOptions
-) -> tuple[Array, Array]:
-    """Refine the pose and its rivals from the dominant plane; keep the one of least truncated cost.
+def _best_calibrated(
+    matches: RankedMatches, found: Sequence[tuple[Array, int]], focal_px: float, options: RobustFitOptions
+) -> TwoViewModel | None:
+    """The best-supported pose among the refined starts and the plane's rivals of the best of them."""
+    threshold = options.refine_threshold_px / focal_px
+    poses = []
+    for M, index in found:
+        start = matches.above(options.starts[index].margin).correspondences
+        pose = pose_from_essential(project_to_essential(M), start[sampson_distance(start, M) < threshold])
+        if pose is None:
+            continue
+        R, t = refine_pose(start, *pose, threshold) if options.refine else pose
+        poses.append(_Pose(R, t, f"start {index + 1}", matches.pose_support(R, t, threshold)))
+    if not poses:
+        return None
+    best = max(poses, key=lambda pose: pose.support)
+    if options.refine:
+        rivals = _plane_rivals(matches, best, threshold, options.seed)
+        best = max([best, *rivals], key=lambda pose: pose.support)
+    E = essential_from_pose(best.R, best.t)
+    return TwoViewModel(M=E, E=E, R=best.R, t=best.t, origin=best.origin)
+
+
+def _best_uncalibrated(
+    matches: RankedMatches, found: Sequence[tuple[Array, int]], focal_px: float, options: RobustFitOptions
+) -> TwoViewModel | None:
+    """The best-supported fundamental matrix, and the pose that the guessed intrinsics make of it."""
+    if not found:
+        return None
+    threshold = options.refine_threshold_px / focal_px
+    M, index = max(found, key=lambda item: matches.support(item[0], threshold))
+    accepted = matches.above(options.starts[index].margin).correspondences
+    E = project_to_essential(M)
+    pose = pose_from_essential(E, accepted[sampson_distance(accepted, M) < threshold])
+    return None if pose is None else TwoViewModel(M, E, *pose, origin=f"start {index + 1}")
+
+
+def _plane_rivals(matches: RankedMatches, best: _Pose, threshold: float, seed: int) -> list[_Pose]:
+    """Refined poses that the dominant plane of a pose's inliers allows.
 
     Where most matches lie on one plane two poses explain them about equally well, and sampling meets one of them
     by chance. The few matches off the plane, and the depths, tell which is right.
     """
-    threshold = options.refine_threshold_px / focal_px
-    R, t = refine_pose(rows, R, t, threshold)
-    near = rows[sampson_distance(rows, essential_from_pose(R, t)) < threshold]
-    H = fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, options.seed)
-    poses = [(R, t)]
-    limit = RIVAL_COST_FACTOR * truncated_cost(rows, R, t, threshold)
+    accepted = matches.above(0.0).correspondences
+    near = accepted[sampson_distance(accepted, essential_from_pose(best.R, best.t)) < threshold]
+    H = fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, seed)
+    rivals = []
     for start in [] if H is None else poses_from_homography(H):
-        if truncated_cost(rows, *start, threshold) < limit:
-            poses.append(refine_pose(rows, *start, threshold))
-    return poses[int(np.argmin([truncated_cost(rows, *pose, threshold, in_front=True) for pose in poses]))]
+        if matches.pose_support(*start, threshold) > RIVAL_SUPPORT_SHARE * best.support:
+            R, t = refine_pose(accepted, *start, threshold)
+            rivals.append(_Pose(R, t, "plane", matches.pose_support(R, t, threshold)))
+    return rivals
 
 
 def estimate_pose(
-    correspondences: Array,
-    order: NDArray[np.intp],
-    focal_px: float,
-    options: RobustFitOptions = RobustFitOptions(),
+    matches: RankedMatches, focal_px: float, options: RobustFitOptions = RobustFitOptions()
 ) -> tuple[Array, Array] | None:
     """Relative pose R (3, 3), t (3,) of calibrated images, or None; arguments as in :func:`estimate_model`."""
-    model = estimate_model(correspondences, order, focal_px, options)
+    model = estimate_model(matches, focal_px, options)
     return None if model is None else (model.R, model.t)
 
 
@@ -170,81 +213,3 @@ def pose_from_essential(E: Array, correspondences: Array) -> tuple[Array, Array]
     if not (np.isfinite(R).all() and np.isfinite(t).all()):
         return None
     return np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64).ravel()
-
-
-def _first_of_equals(rows: Array) -> NDArray[np.intp]:
-    """Positions of the distinct rows in their order: a match that is listed ten times supports a model once."""
-    _, first = np.unique(rows, axis=0, return_index=True)
-    return np.sort(first)
-
-
-def _fit_opencv(rows: Array, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Array | None:
-    """The model by one of OpenCV's estimators; None where it finds nothing."""
-    if options.method == "ransac" and options.seed:
-        # The classic RANSAC has a generator of its own with a fixed seed: shuffling is what changes its draws.
-        rows = rows[np.random.default_rng(options.seed).permutation(len(rows))]
-    # For F OpenCV holds some constants in pixels (MAGSAC fails on the normalised plane); E it normalises itself.
-    unit = 1.0 if calibrated else focal_px
-    x1, x2 = (np.ascontiguousarray(part * unit) for part in (rows[:, :2], rows[:, 2:]))
-    threshold = options.threshold_px / focal_px * unit
-    limits = (options.confidence, options.max_iterations)
-    try:
-        if options.method == "ransac" and calibrated:
-            M, _ = _find_essential_mat(x1, x2, np.eye(3), cv2.RANSAC, limits[0], threshold, limits[1])
-        elif options.method == "ransac":
-            M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
-        else:
-            prosac = options.method == "prosac"
-            sampler = cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM
-            score = cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC
-            params = usac_params(sampler, score, threshold, *limits, options.seed)
-            if calibrated:
-                # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
-                M, _ = _find_essential_mat(x1, x2, np.eye(3), np.eye(3), None, None, params)
-            else:
-                M, _ = _find_fundamental_mat(x1, x2, params)
-    except cv2.error:
-        return None
-    return _best_of_stack(M, np.diag([unit, unit, 1.0]), rows, options.threshold_px / focal_px)
-
-
-def _best_of_stack(M: Any, scale: Array, rows: Array, threshold: float) -> Array | None:
-    """The best of the models that an estimator stacks, (3k, 3); None where none is usable.
-
-    Args:
-        M: for points multiplied by ``scale`` (3, 3); the answer, of unit Frobenius norm, is for ``rows`` (N, 4).
-    """
-    if M is None or np.size(M) == 0 or np.size(M) % 9:
-        return None
-    models = [scale @ m @ scale for m in np.reshape(M, (-1, 3, 3)) if np.isfinite(m).all() and np.any(m)]
-    costs = [np.sum(np.minimum(sampson_distance(rows, m), threshold) ** 2) for m in models]
-    if not models:
-        return None
-    best = np.asarray(models[int(np.argmin(costs))], dtype=np.float64)
-    return best / float(np.linalg.norm(best))
-
-
-def _fit_poselib(rows: Array, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Array | None:
-    """The model by PoseLib's LO-RANSAC with progressive sampling; None where it finds nothing."""
-    try:
-        import poselib
-    except ImportError as error:
-        raise ImportError("method='poselib' needs PoseLib: pip install 'mgca-filter[poselib]'") from error
-    ransac = {
-        "max_epipolar_error": options.threshold_px,
-        "progressive_sampling": True,
-        "success_prob": options.confidence,
-        "max_iterations": options.max_iterations,
-        "min_iterations": min(_POSELIB_MIN_ITERATIONS, options.max_iterations),
-        "seed": options.seed,
-    }
-    # One camera of the mean focal length puts PoseLib's thresholds in the pixels that this package uses.
-    points1, points2 = rows[:, :2] * focal_px, rows[:, 2:] * focal_px
-    if not calibrated:
-        F, _ = poselib.estimate_fundamental(points1, points2, ransac, {})
-        return _best_of_stack(F, np.diag([focal_px, focal_px, 1.0]), rows, options.threshold_px / focal_px)
-    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal_px, 0.0, 0.0]}
-    pose, information = poselib.estimate_relative_pose(points1, points2, camera, camera, ransac, {})
-    if information.get("num_inliers", 0) == 0:
-        return None
-    return _best_of_stack(essential_from_pose(pose.R, pose.t), np.eye(3), rows, options.threshold_px / focal_px)

@@ -98,13 +98,3 @@ def assemble_logits(
         # Degenerate input (all points equal, say) may leave the network without a finite answer.
         logits[sent.rows] = np.where(np.isfinite(output.logits), output.logits, INVALID_LOGIT)
     return logits
-
-
-def select_for_fit(
-    logits: NDArray[np.float32], sent: NetworkInput, decision_threshold: float, min_count: int
-) -> NDArray[np.intp]:
-    """Rows of the matches that the robust fit sees: the accepted ones, or the best ``min_count`` if those are few."""
-    accepted = sent.rows[logits[sent.rows] > decision_threshold]
-    if len(accepted) >= min_count:
-        return accepted
-    return sent.rows[np.argsort(-logits[sent.rows], kind="stable")[:min_count]]

@@ -12,6 +12,7 @@ from . import degeneracy
 from .epipolar import fundamental_from_essential, sampson_distance
 from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, homography_distance
 from .pair_input import PairInput
+from .ranking import RankedMatches
 from .result import Status
 from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model
 
@@ -34,7 +35,7 @@ class Verdict:
 def judge(
     pair: PairInput,
     model: TwoViewModel | None,
-    order: NDArray[np.intp],
+    ranked: RankedMatches,
     mask_threshold_px: float,
     options: RobustFitOptions,
 ) -> Verdict:
@@ -43,7 +44,7 @@ def judge(
     Args:
         pair: the pair, M matches.
         model: the fitted model, or None.
-        order: (K,) rows that it was fitted to, best first.
+        ranked: what it was fitted to; those above the decision threshold bear witness.
         mask_threshold_px: Sampson distance below which a match is kept, pixels.
         options: of the robust fit; the rules below measure at its ``refine_threshold_px``.
     """
@@ -53,9 +54,10 @@ def judge(
     if model is None:
         return Verdict(Status.NO_GEOMETRY, nothing)
     threshold = options.refine_threshold_px / pair.focal_px
-    fitted = pair.correspondences[order]
-    inlier_rows = order[sampson_distance(fitted, model.M) < threshold]
-    inliers = pair.correspondences[inlier_rows]
+    accepted = ranked.above(0.0)
+    fitted = accepted.correspondences
+    near = sampson_distance(fitted, model.M) < threshold
+    inlier_rows, inliers = accepted.rows[near], fitted[near]
     if len(inliers) < MIN_MATCHES:
         return Verdict(Status.NO_GEOMETRY, nothing)
     support = degeneracy.measure_support(fitted, model.M, threshold)
@@ -63,7 +65,7 @@ def judge(
         if degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
             return Verdict(Status.NO_GEOMETRY, nothing)
     info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
-    suspicious = _contradicts_intrinsics(pair, order, support, options)
+    suspicious = _contradicts_intrinsics(pair, accepted, support, options)
     if support.log10_nfa > degeneracy.UNRELATED_LOG10_NFA and not suspicious:
         return Verdict(Status.UNRELATED, nothing, info=info)
     verdict = _keep_model(pair, model, mask_threshold_px, info)
@@ -92,16 +94,16 @@ def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, 
 
 
 def _contradicts_intrinsics(
-    pair: PairInput, order: NDArray[np.intp], support: degeneracy.Support, options: RobustFitOptions
+    pair: PairInput, accepted: RankedMatches, support: degeneracy.Support, options: RobustFitOptions
 ) -> bool:
     """True where F, which knows no intrinsics, explains far more matches than the caller's intrinsics allow."""
-    if not pair.calibrated or 2 * support.count >= len(order):
+    if not pair.calibrated or 2 * support.count >= len(accepted.rows):
         return False
-    model = estimate_model(pair.correspondences, order, pair.focal_px, options, calibrated=False)
+    model = estimate_model(accepted, pair.focal_px, options, calibrated=False)
     if model is None:
         return False
     threshold = options.refine_threshold_px / pair.focal_px
-    free = degeneracy.measure_support(pair.correspondences[order], model.M, threshold)
+    free = degeneracy.measure_support(accepted.correspondences, model.M, threshold)
     return (
         free.count >= degeneracy.INTRINSICS_SUPPORT_FACTOR * support.count + degeneracy.MIN_SUPPORT
         and free.log10_nfa < degeneracy.LOW_SUPPORT_LOG10_NFA

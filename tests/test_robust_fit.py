@@ -11,14 +11,16 @@ from conftest import K, Scene, make_scene
 
 from mgca_filter.correspondences import normalize_points
 from mgca_filter.epipolar import cross_matrix, pose_error_deg
+from mgca_filter.estimators import METHODS
 from mgca_filter.homography import fit_homography, homography_distance, poses_from_homography, usac_params
 from mgca_filter.pose_refinement import refine_pose, rotation_from_vector, truncated_cost
+from mgca_filter.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
 from mgca_filter.robust_fit import (
-    METHODS,
+    SINGLE_START,
     RobustFitOptions,
+    Start,
     estimate_model,
     estimate_pose,
-    match_order,
     pose_from_essential,
 )
 
@@ -34,6 +36,10 @@ def ratio_order(scene: Scene) -> np.ndarray:
     return np.argsort(scene.attributes.ratio, kind="stable")
 
 
+def by_ratio(scene: Scene) -> RankedMatches:
+    return RankedMatches.of(normalized(scene), ratio_order(scene))
+
+
 def options_of(method: str, **changes: object) -> RobustFitOptions:
     if method == "poselib":
         pytest.importorskip("poselib")
@@ -42,7 +48,7 @@ def options_of(method: str, **changes: object) -> RobustFitOptions:
 
 @pytest.mark.parametrize("method", ESTIMATORS)
 def test_every_method_finds_the_pose(method: str, scene: Scene) -> None:
-    model = estimate_model(normalized(scene), ratio_order(scene), FOCAL, options_of(method))
+    model = estimate_model(by_ratio(scene), FOCAL, options_of(method))
     assert model is not None
     assert pose_error_deg(model.R, model.t, scene.R, scene.t) < 1.0
     assert float(model.t @ scene.t) > 0
@@ -54,7 +60,7 @@ def test_every_method_finds_the_pose(method: str, scene: Scene) -> None:
 
 @pytest.mark.parametrize("method", ESTIMATORS)
 def test_without_intrinsics_the_fundamental_matrix_fits(method: str, scene: Scene) -> None:
-    model = estimate_model(normalized(scene), ratio_order(scene), FOCAL, options_of(method), calibrated=False)
+    model = estimate_model(by_ratio(scene), FOCAL, options_of(method), calibrated=False)
     assert model is not None
     assert np.linalg.norm(model.M) == pytest.approx(1.0)
     assert pose_error_deg(model.R, model.t, scene.R, scene.t) < 5.0
@@ -63,10 +69,7 @@ def test_without_intrinsics_the_fundamental_matrix_fits(method: str, scene: Scen
 @pytest.mark.parametrize("method", ESTIMATORS)
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_same_seed_gives_the_same_bits(method: str, calibrated: bool, scene: Scene) -> None:
-    fits = [
-        estimate_model(normalized(scene), ratio_order(scene), FOCAL, options_of(method, seed=3), calibrated)
-        for _ in range(2)
-    ]
+    fits = [estimate_model(by_ratio(scene), FOCAL, options_of(method, seed=3), calibrated) for _ in range(2)]
     assert fits[0] is not None
     assert fits[1] is not None
     np.testing.assert_array_equal(fits[0].M, fits[1].M)
@@ -76,7 +79,7 @@ def test_same_seed_gives_the_same_bits(method: str, calibrated: bool, scene: Sce
 def test_another_seed_draws_other_samples(method: str) -> None:
     hard = make_scene(right=40, wrong=160, noise_px=1.0)
     options = [options_of(method, seed=seed, refine=False, max_iterations=50) for seed in range(6)]
-    fits = [estimate_model(normalized(hard), ratio_order(hard), FOCAL, option) for option in options]
+    fits = [estimate_model(by_ratio(hard), FOCAL, option) for option in options]
     found = {fit.M.tobytes() for fit in fits if fit is not None}
     assert len(found) > 1
 
@@ -98,8 +101,8 @@ def test_seed_zero_is_the_preset_of_opencv(scene: Scene) -> None:
 
 def test_every_option_counts() -> None:
     hard = make_scene(right=40, wrong=160, noise_px=1.0)
-    base = RobustFitOptions(confidence=0.9, max_iterations=40)
-    reference = estimate_model(normalized(hard), ratio_order(hard), FOCAL, base)
+    base = RobustFitOptions(confidence=0.9, max_iterations=40, starts=SINGLE_START)
+    reference = estimate_model(by_ratio(hard), FOCAL, base)
     assert reference is not None
     changes = {
         "threshold_px": 2.5,
@@ -107,20 +110,21 @@ def test_every_option_counts() -> None:
         "refine": False,
         "refine_threshold_px": 3.0,
         "method": "ransac",
+        "starts": (Start(0.0, 3.0),),
     }
     for name, value in changes.items():
-        other = estimate_model(normalized(hard), ratio_order(hard), FOCAL, replace(base, **{name: value}))
+        other = estimate_model(by_ratio(hard), FOCAL, replace(base, **{name: value}))
         assert other is None or not np.array_equal(other.E, reference.E), name
 
 
 def test_prosac_uses_the_order(scene: Scene) -> None:
     hard = make_scene(right=40, wrong=400)
     good_first = np.argsort(~hard.inlier, kind="stable")
-    few = RobustFitOptions(max_iterations=20)
-    pose = estimate_pose(normalized(hard), good_first, FOCAL, few)
+    few = RobustFitOptions(max_iterations=20, starts=SINGLE_START)
+    pose = estimate_pose(RankedMatches.of(normalized(hard), good_first), FOCAL, few)
     assert pose is not None
     assert pose_error_deg(*pose, hard.R, hard.t) < 2.0
-    worst = estimate_pose(normalized(hard), good_first[::-1].copy(), FOCAL, few)
+    worst = estimate_pose(RankedMatches.of(normalized(hard), good_first[::-1]), FOCAL, few)
     assert worst is None or pose_error_deg(*worst, hard.R, hard.t) > 5.0
 
 
@@ -128,9 +132,9 @@ def test_prosac_uses_the_order(scene: Scene) -> None:
 @pytest.mark.parametrize("count", range(8))
 def test_too_few_matches_give_none(method: str, count: int, scene: Scene) -> None:
     order = ratio_order(scene)[:count]
-    assert estimate_model(normalized(scene), order, FOCAL, options_of(method)) is None
+    assert estimate_model(RankedMatches.of(normalized(scene), order), FOCAL, options_of(method)) is None
     repeated = np.repeat(order, 20)
-    assert estimate_model(normalized(scene), repeated, FOCAL, options_of(method)) is None
+    assert estimate_model(RankedMatches.of(normalized(scene), repeated), FOCAL, options_of(method)) is None
 
 
 @pytest.mark.parametrize("method", ESTIMATORS)
@@ -139,22 +143,69 @@ def test_degenerate_points_do_not_raise(method: str, calibrated: bool) -> None:
     rng = np.random.default_rng(0)
     line = np.linspace(-1, 1, 30)[:, None] * [[0.5, 0.25, 0.5, 0.25]]
     for rows in (line, line + [[0, 0, 0.1, 0]], rng.uniform(-1, 1, (30, 4)), np.eye(30, 4)):
-        model = estimate_model(rows, np.arange(30), FOCAL, options_of(method), calibrated)
+        model = estimate_model(RankedMatches.of(rows, np.arange(30)), FOCAL, options_of(method), calibrated)
         assert model is None or np.isfinite(model.E).all()
 
 
 def test_poselib_missing_names_the_extra(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     monkeypatch.setitem(__import__("sys").modules, "poselib", None)
     with pytest.raises(ImportError, match=r"mgca-filter\[poselib\]"):
-        estimate_model(normalized(scene), ratio_order(scene), FOCAL, RobustFitOptions(method="poselib"))
+        estimate_model(by_ratio(scene), FOCAL, RobustFitOptions(method="poselib"))
 
 
 def test_order_mixes_score_and_ratio() -> None:
-    scores = np.array([0.9, 0.99, 0.99, 0.1], dtype=np.float32)
+    margins = np.array([2.0, 4.0, 4.0, -2.0], dtype=np.float32)
     ratio = np.array([0.3, 0.9, 0.5, 0.1], dtype=np.float32)
     known = np.ones(4, dtype=bool)
-    assert match_order(scores, ratio, known).tolist() == [0, 2, 1, 3]
-    assert match_order(scores, ratio, ~known).tolist() == [1, 2, 0, 3]
+    assert match_order(margins, ratio, known).tolist() == [0, 2, 1, 3]
+    assert match_order(margins, ratio, ~known).tolist() == [1, 2, 0, 3]
+
+
+def test_ranked_matches_hold_each_match_once_and_keep_their_order() -> None:
+    rows = np.arange(12.0).reshape(3, 4)[[0, 1, 0, 2]]
+    ranked = RankedMatches.of(rows, np.array([3, 2, 0, 1]), np.array([0.1, 0.2, 0.3, 0.4]), np.arange(4.0))
+    assert ranked.rows.tolist() == [3, 2, 1]
+    np.testing.assert_array_equal(ranked.correspondences, rows[[3, 2, 1]])
+    np.testing.assert_array_equal(ranked.weights, [0.4, 0.3, 0.2])
+    np.testing.assert_array_equal(ranked.margins, [3.0, 2.0, 1.0])
+
+
+def test_above_a_margin_or_the_best_of_all() -> None:
+    count = 3 * MIN_FIT_MATCHES
+    rows = np.random.default_rng(0).uniform(-1, 1, (count, 4))
+    margins = np.linspace(-1, 1, count)
+    ranked = RankedMatches.of(rows, np.random.default_rng(1).permutation(count), margins=margins)
+    for margin, expected in ((0.0, margins > 0), (0.9, margins >= margins[-MIN_FIT_MATCHES])):
+        chosen = ranked.above(margin)
+        assert chosen.rows.tolist() == [row for row in ranked.rows if expected[row]]
+        np.testing.assert_array_equal(chosen.correspondences, rows[chosen.rows])
+
+
+def test_support_counts_weights_agreement_and_depth(scene: Scene) -> None:
+    exact = make_scene(noise_px=0.0, wrong=0)
+    weights = np.linspace(0.1, 1.0, len(exact.points1))
+    ranked = RankedMatches.of(normalized(exact), np.arange(len(weights)), weights)
+    E = cross_matrix(exact.t) @ exact.R
+    assert ranked.support(E, 0.01) == pytest.approx(weights.sum())
+    assert ranked.pose_support(exact.R, exact.t, 0.01) == pytest.approx(weights.sum())
+    assert ranked.support(cross_matrix(-exact.t) @ exact.R, 0.01) == pytest.approx(weights.sum())
+    assert ranked.pose_support(exact.R, -exact.t, 0.01) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_the_best_supported_start_wins(calibrated: bool) -> None:
+    hard = make_scene(right=60, wrong=600)
+    margins = np.where(hard.inlier, 1.0, -1.0)
+    hopeless = np.random.default_rng(0).permutation(np.flatnonzero(~hard.inlier))
+    order = np.concatenate([hopeless, np.flatnonzero(hard.inlier)])
+    ranked = RankedMatches.of(normalized(hard), order, np.where(hard.inlier, 0.9, 0.1), margins)
+    blind, seeing = Start(-2.0, 1.0), Start(0.0, 1.0)
+    few = RobustFitOptions(max_iterations=20, starts=(blind, seeing), refine=False)
+    model = estimate_model(ranked, FOCAL, few, calibrated)
+    assert model is not None
+    assert model.origin == "start 2"
+    alone = estimate_model(ranked, FOCAL, replace(few, starts=(blind,)), calibrated)
+    assert alone is None or pose_error_deg(alone.R, alone.t, hard.R, hard.t) > 5.0
 
 
 def test_pose_puts_points_in_front_however_far(scene: Scene) -> None:
@@ -176,12 +227,6 @@ def test_refinement_lowers_the_cost_and_the_error(scene: Scene) -> None:
     refined = refine_pose(rows, R, t, threshold, rounds=30)
     assert truncated_cost(rows, *refined, threshold) < truncated_cost(rows, R, t, threshold)
     assert pose_error_deg(*refined, scene.R, scene.t) < 0.5 * pose_error_deg(R, t, scene.R, scene.t)
-
-
-def test_cost_counts_matches_behind_a_camera_as_wrong(scene: Scene) -> None:
-    rows = normalized(make_scene(noise_px=0.0, wrong=0))
-    assert truncated_cost(rows, scene.R, scene.t, 0.01, in_front=True) == pytest.approx(0.0, abs=1e-12)
-    assert truncated_cost(rows, scene.R, -scene.t, 0.01, in_front=True) == pytest.approx(len(rows) * 1e-4)
 
 
 def test_homography_of_a_plane_holds_its_pose() -> None:

@@ -1,0 +1,135 @@
+"""OpenCV's and PoseLib's estimators of the essential and the fundamental matrix: one call, one model or None.
+
+With ``homography.py`` the only caller of robust estimators. Points lie on the normalised image planes; thresholds
+come in pixels with the mean focal length that converts them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .epipolar import essential_from_pose, sampson_distance
+from .homography import usac_params
+
+Array = NDArray[np.float64]
+
+METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
+_POSELIB_MIN_ITERATIONS = 1000
+# Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
+_find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
+
+
+@dataclass(frozen=True)
+class EstimatorOptions:
+    """Options of one call.
+
+    Attributes:
+        method: ``"prosac"``, ``"magsac"``, ``"ransac"`` or ``"poselib"``; PROSAC and PoseLib use the order.
+        threshold_px: Sampson distance that counts as inlier, pixels.
+        confidence: probability that a sample without outliers was drawn.
+        max_iterations: largest number of samples.
+        seed: of the random numbers.
+    """
+
+    method: str = "prosac"
+    threshold_px: float = 0.5
+    confidence: float = 0.9999
+    max_iterations: int = 5000
+    seed: int = 0
+
+
+def fit_epipolar(rows: Array, focal_px: float, options: EstimatorOptions, calibrated: bool) -> Array | None:
+    """Essential (``calibrated``) or fundamental matrix (3, 3) of unit Frobenius norm, in normalised coordinates.
+
+    Args:
+        rows: (N, 4) distinct matches on the normalised image planes, the most promising first.
+        focal_px: mean focal length, pixels.
+        options: of the estimator.
+        calibrated: estimate E with five points; else F with seven.
+
+    Returns:
+        The matrix, or None where the estimator finds nothing.
+
+    Raises:
+        ImportError: ``method="poselib"`` without PoseLib.
+    """
+    if options.method == "poselib":
+        return _fit_poselib(rows, focal_px, options, calibrated)
+    return _fit_opencv(rows, focal_px, options, calibrated)
+
+
+def _fit_opencv(rows: Array, focal_px: float, options: EstimatorOptions, calibrated: bool) -> Array | None:
+    """The model by one of OpenCV's estimators; None where it finds nothing."""
+    if options.method == "ransac" and options.seed:
+        # The classic RANSAC has a generator of its own with a fixed seed: shuffling is what changes its draws.
+        rows = rows[np.random.default_rng(options.seed).permutation(len(rows))]
+    # For F OpenCV holds some constants in pixels (MAGSAC fails on the normalised plane); E it normalises itself.
+    unit = 1.0 if calibrated else focal_px
+    x1, x2 = (np.ascontiguousarray(part * unit) for part in (rows[:, :2], rows[:, 2:]))
+    threshold = options.threshold_px / focal_px * unit
+    limits = (options.confidence, options.max_iterations)
+    try:
+        if options.method == "ransac" and calibrated:
+            M, _ = _find_essential_mat(x1, x2, np.eye(3), cv2.RANSAC, limits[0], threshold, limits[1])
+        elif options.method == "ransac":
+            M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
+        else:
+            prosac = options.method == "prosac"
+            sampler = cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM
+            score = cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC
+            params = usac_params(sampler, score, threshold, *limits, options.seed)
+            if calibrated:
+                # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
+                M, _ = _find_essential_mat(x1, x2, np.eye(3), np.eye(3), None, None, params)
+            else:
+                M, _ = _find_fundamental_mat(x1, x2, params)
+    except cv2.error:
+        return None
+    return _best_of_stack(M, np.diag([unit, unit, 1.0]), rows, options.threshold_px / focal_px)
+
+
+def _best_of_stack(M: Any, scale: Array, rows: Array, threshold: float) -> Array | None:
+    """The best of the models that an estimator stacks, (3k, 3); None where none is usable.
+
+    Args:
+        M: for points multiplied by ``scale`` (3, 3); the answer, of unit Frobenius norm, is for ``rows`` (N, 4).
+    """
+    if M is None or np.size(M) == 0 or np.size(M) % 9:
+        return None
+    models = [scale @ m @ scale for m in np.reshape(M, (-1, 3, 3)) if np.isfinite(m).all() and np.any(m)]
+    costs = [np.sum(np.minimum(sampson_distance(rows, m), threshold) ** 2) for m in models]
+    if not models:
+        return None
+    best = np.asarray(models[int(np.argmin(costs))], dtype=np.float64)
+    return best / float(np.linalg.norm(best))
+
+
+def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibrated: bool) -> Array | None:
+    """The model by PoseLib's LO-RANSAC with progressive sampling; None where it finds nothing."""
+    try:
+        import poselib
+    except ImportError as error:
+        raise ImportError("method='poselib' needs PoseLib: pip install 'mgca-filter[poselib]'") from error
+    ransac = {
+        "max_epipolar_error": options.threshold_px,
+        "progressive_sampling": True,
+        "success_prob": options.confidence,
+        "max_iterations": options.max_iterations,
+        "min_iterations": min(_POSELIB_MIN_ITERATIONS, options.max_iterations),
+        "seed": options.seed,
+    }
+    # One camera of the mean focal length puts PoseLib's thresholds in the pixels that this package uses.
+    points1, points2 = rows[:, :2] * focal_px, rows[:, 2:] * focal_px
+    if not calibrated:
+        F, _ = poselib.estimate_fundamental(points1, points2, ransac, {})
+        return _best_of_stack(F, np.diag([focal_px, focal_px, 1.0]), rows, options.threshold_px / focal_px)
+    camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal_px, 0.0, 0.0]}
+    pose, information = poselib.estimate_relative_pose(points1, points2, camera, camera, ransac, {})
+    if information.get("num_inliers", 0) == 0:
+        return None
+    return _best_of_stack(essential_from_pose(pose.R, pose.t), np.eye(3), rows, options.threshold_px / focal_px)
