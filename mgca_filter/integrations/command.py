@@ -1,0 +1,197 @@
+"""``mgca-match colmap | hloc | folder``: the subcommands' arguments."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from ..cli import EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE, UsageError, _intrinsics, _OneLineParser, _positive
+from ..errors import MgcaFilterError
+from .pair_job import EngineOptions, Summary
+
+_EPILOG = """\
+exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
+written. A killed run goes on where it stopped when the same command is given again."""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The subcommands' arguments."""
+    parser = _OneLineParser(prog="mgca-match", epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=_OneLineParser)
+    for add in (_add_colmap, _add_hloc, _add_folder):
+        command = add(commands)
+        command.epilog, command.formatter_class = _EPILOG, argparse.RawDescriptionHelpFormatter
+        _add_common(command)
+    return parser
+
+
+def _add_colmap(commands: Any) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        "colmap", description="Filter the matches of a COLMAP database and write its two_view_geometries."
+    )
+    command.add_argument("database", metavar="DATABASE", type=Path)
+    target = command.add_mutually_exclusive_group(required=True)
+    target.add_argument("-o", "--output", metavar="OUT.db", type=Path, help="a copy of DATABASE with our geometries")
+    target.add_argument("--in-place", action="store_true", help="write them into DATABASE itself")
+    command.add_argument("--no-descriptors", action="store_true", help="do not compute distance ratios")
+    command.add_argument("--compare", action="store_true", help="run COLMAP's mapper on its verification and on ours")
+    command.add_argument("--truth", metavar="MODEL", type=Path, help="folder of a COLMAP model, for --compare")
+    command.set_defaults(run=_run_colmap)
+    return command
+
+
+def _add_hloc(commands: Any) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        "hloc", description="Filter hloc's matches: what the filter drops becomes -1 in a copy of MATCHES.h5."
+    )
+    command.add_argument("features", metavar="FEATURES.h5", type=Path)
+    command.add_argument("matches", metavar="MATCHES.h5", type=Path)
+    command.add_argument("-o", "--output", metavar="FILTERED.h5", type=Path, required=True)
+    command.add_argument("--no-descriptors", action="store_true", help="do not compute distance ratios")
+    command.set_defaults(run=_run_hloc)
+    return command
+
+
+def _add_folder(commands: Any) -> argparse.ArgumentParser:
+    command: argparse.ArgumentParser = commands.add_parser(
+        "folder", description="Match the images of a folder and filter the matches."
+    )
+    command.add_argument("images", metavar="IMAGES", type=Path)
+    command.add_argument(
+        "-o", "--output", metavar="OUT", type=Path, required=True, help="OUT.db (COLMAP), OUT.h5 (hloc) or OUT.jsonl"
+    )
+    command.add_argument(
+        "--pairs", metavar="FILE|exhaustive|sequential", default="exhaustive", help="which to match, default exhaustive"
+    )
+    command.add_argument("--overlap", metavar="N", type=_positive(int), default=10, help="sequential: N next images")
+    command.add_argument("--K", metavar="fx,fy,cx,cy", type=_intrinsics, help="intrinsics of all images, pixels")
+    command.add_argument("--detector", choices=("sift", "orb", "akaze"), default="sift")
+    command.add_argument("--max-keypoints", metavar="N", type=_positive(int), default=2000, help="default 2000")
+    command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
+    command.set_defaults(run=_run_folder)
+    return command
+
+
+def _add_common(command: argparse.ArgumentParser) -> None:
+    group = command.add_argument_group("filter")
+    group.add_argument("--threshold", metavar="PX", type=_positive(float), default=1.0, help="pixels, default 1.0")
+    group.add_argument("--method", choices=("prosac", "magsac", "ransac", "poselib"), default="prosac")
+    group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
+    group.add_argument("--seed", type=int, default=0)
+    workers = command.add_argument_group("workers")
+    workers.add_argument("-j", "--jobs", metavar="N", type=_positive(int), default=1, help="workers, default 1")
+    workers.add_argument("--engine", choices=("local", "ray"), default="local")
+    workers.add_argument("--address", metavar="HOST", help='of a Ray cluster ("auto" = this machine\'s)')
+    command.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary, errors only")
+    command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
+
+
+def _filter_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Options of the filter, as JSON values: they are part of what a resumed run must have in common."""
+    model = None if options.model is None else str(options.model)
+    return {"threshold": options.threshold, "method": options.method, "model": model, "seed": options.seed}
+
+
+def _check_output(options: argparse.Namespace, output: Path, inputs: Sequence[Path]) -> None:
+    if not output.parent.is_dir() or output.is_dir():
+        raise UsageError(f"{output}: {'is a folder' if output.is_dir() else 'its folder does not exist'}")
+    for path in inputs:
+        if output.exists() and path.exists() and output.samefile(path):
+            raise UsageError(f"{output}: is the input")
+    if output.exists() and not options.overwrite:
+        raise UsageError(f"{output}: exists; --overwrite replaces it")
+
+
+def _run_colmap(options: argparse.Namespace) -> Summary:
+    from .colmap import ColmapJob
+
+    if options.in_place:
+        output = options.database
+    else:
+        output = options.output
+        _check_output(options, output, [options.database])
+    if options.truth is not None and not options.compare:
+        raise UsageError("--truth goes with --compare")
+    job = ColmapJob(options.database, output, use_descriptors=not options.no_descriptors)
+    summary = _with_engine(job, options)
+    if options.compare:
+        from .colmap_compare import compare, comparison_table
+
+        print(comparison_table(compare(output, summary.seconds, options.truth, options.jobs)))
+    return summary
+
+
+def _run_hloc(options: argparse.Namespace) -> Summary:
+    from .hloc import HlocJob
+
+    _check_output(options, options.output, [options.features, options.matches])
+    job = HlocJob(options.features, options.matches, options.output, use_descriptors=not options.no_descriptors)
+    return _with_engine(job, options)
+
+
+def _run_folder(options: argparse.Namespace) -> Summary:
+    from .folder import OUTPUTS, FolderJob
+    from .folder_pairs import exhaustive_pairs, list_images, read_pairs, sequential_pairs
+
+    if options.output.suffix not in OUTPUTS:
+        raise UsageError(f"{options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
+    _check_output(options, options.output, [])
+    names = list_images(options.images)
+    if options.pairs == "exhaustive":
+        pairs = exhaustive_pairs(names)
+    elif options.pairs == "sequential":
+        pairs = sequential_pairs(names, options.overlap)
+    else:
+        pairs = read_pairs(Path(options.pairs), names, options.images)
+    if not pairs:
+        raise UsageError(f"{options.images}: no pairs to match")
+    job = FolderJob(
+        options.images,
+        pairs,
+        options.output,
+        options.K,
+        options.detector,
+        options.max_keypoints,
+        options.cache,
+    )
+    return _with_engine(job, options)
+
+
+def _with_engine(job: Any, options: argparse.Namespace) -> Summary:
+    if options.address is not None and options.engine != "ray":
+        raise UsageError("--address goes with --engine ray")
+    filter_options = _filter_options(options)
+    engine = EngineOptions(options.engine, options.jobs, options.address).open(filter_options)
+    try:
+        summary: Summary = job.run(engine, filter_options, options.quiet)
+    finally:
+        engine.close()
+    for message in summary.failures:
+        print(f"mgca-match: {message}", file=sys.stderr)
+    if not options.quiet:
+        print(summary)
+    return summary
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run a subcommand; returns the exit status (0 = geometry found, 1 = for no pair, 2 = usage or files)."""
+    try:
+        options = build_parser().parse_args(arguments)
+        summary = options.run(options)
+    except ImportError as error:
+        print(f"mgca-match: {error}; pip install 'mgca_filter[{arguments[0]}]' brings it", file=sys.stderr)
+        return EXIT_USAGE
+    except OSError as error:
+        words = f"{error.filename}: {error.strerror}" if error.filename else " ".join(str(error).split())
+        print(f"mgca-match: {words}", file=sys.stderr)
+        return EXIT_USAGE
+    except (UsageError, MgcaFilterError, ValueError, TypeError) as error:
+        print(f"mgca-match: {' '.join(str(error).split())}", file=sys.stderr)
+        return EXIT_USAGE
+    except KeyboardInterrupt:
+        print("mgca-match: interrupted; the same command goes on where it stopped", file=sys.stderr)
+        return EXIT_USAGE
+    return EXIT_FOUND if summary.found_geometry else EXIT_NO_GEOMETRY

@@ -1,0 +1,82 @@
+"""Features of images on disk, one file each, found again as long as image and detector are the same."""
+
+from __future__ import annotations
+
+import hashlib
+import zipfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .engines import Engine
+from .journal import file_stamp, replaced_when_done
+from .pair_job import progress_bar
+from .pair_worker import ImageFeatures
+
+
+@dataclass(frozen=True)
+class FeatureCache:
+    """A folder of ``.npz`` files.
+
+    Attributes:
+        folder: where they lie. images: the folder that the names of the images are relative to.
+        detector, max_keypoints: as in :func:`mgca_filter.match_images`.
+    """
+
+    folder: Path
+    images: Path
+    detector: str
+    max_keypoints: int
+
+    def fill(self, names: Sequence[str], engine: Engine, quiet: bool = False) -> list[str]:
+        """Extract what is missing; returns the images that cannot be read or decoded."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        missing = [name for name in names if not self._path(name).is_file()]
+        unreadable = []
+
+        def tasks() -> Iterator[tuple[Any, ...]]:
+            for name in missing:
+                yield name, _bytes_or_none(self.images / name), self.detector, self.max_keypoints
+
+        with progress_bar("images", len(names), len(names) - len(missing), quiet) as bar:
+            for name, features in engine.map("extract", tasks()):
+                if features is None:
+                    unreadable.append(name)
+                else:
+                    self._write(name, features)
+                bar.update()
+        return sorted(unreadable)
+
+    def read(self, name: str) -> ImageFeatures | None:
+        """Features of an image; None where there are none."""
+        try:
+            with np.load(self._path(name)) as data:
+                table, descriptors, (width, height) = data["keypoints"], data["descriptors"], data["image_size"]
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+            return None
+        return ImageFeatures(table[:, :2], table[:, 2], table[:, 3], descriptors, None, (int(width), int(height)))
+
+    def _write(self, name: str, features: ImageFeatures) -> None:
+        size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))
+        with replaced_when_done(self._path(name)) as partial, partial.open("wb") as file:
+            np.savez(
+                file,
+                keypoints=np.column_stack([features.points, size, angle]),
+                descriptors=descriptors,
+                image_size=np.array(features.image_size),
+            )
+
+    def _path(self, name: str) -> Path:
+        key = repr((name, file_stamp(self.images / name), self.detector, self.max_keypoints))
+        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npz"
+
+
+def _bytes_or_none(path: Path) -> bytes:
+    """The file, empty where it cannot be read: one bad image does not stop the others."""
+    try:
+        return path.read_bytes()
+    except OSError:
+        return b""

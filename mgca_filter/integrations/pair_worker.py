@@ -1,0 +1,212 @@
+"""One pair of images through the public door: features and matches in, one row out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correspondences import MatchAttributes
+from ..keypoints import create_detector, detect_keypoints
+from ..match_filter import MatchFilter
+from ..matching import best_of_list, distance_ratio, match_descriptors
+from ..result import FilterResult, Status
+
+FAILED = "failed"
+# A model of these explains the pair; the matches of all other pairs are dropped.
+EXPLAINED = frozenset(status.value for status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION))
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What a pipeline knows of one image.
+
+    Attributes:
+        points: (N, 2) pixels, OpenCV's convention; free of distortion where ``K`` is known.
+        size, angle: (N,) diameters in pixels and orientations in degrees, or None.
+        descriptors: (N, D), or None.
+        K: (3, 3) intrinsics, or None.
+        image_size: (width, height) in pixels, or None.
+    """
+
+    points: NDArray[Any]
+    size: NDArray[Any] | None = None
+    angle: NDArray[Any] | None = None
+    descriptors: NDArray[Any] | None = None
+    K: NDArray[np.float64] | None = None
+    image_size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class PairRow:
+    """The answer for one pair; conventions and pixels as in :class:`mgca_filter.FilterResult`.
+
+    Attributes:
+        name1, name2: the images, in the order in which the source names them.
+        status: a :class:`mgca_filter.Status` value, or ``"failed"`` for a pair that could not be read.
+        num_matches: M, the number of putative matches.
+        kept: (K, 2) uint32 keypoint indices of the matches that are kept; empty where nothing explains the pair.
+        scores: (K,) float32, their probabilities.
+        calibrated: the geometry was fitted with known intrinsics.
+        E, F, H, R, t: matrices, or None; ``H`` is a homography that explains the pair.
+        message: why the pair failed, or "".
+    """
+
+    name1: str
+    name2: str
+    status: str
+    num_matches: int
+    kept: NDArray[np.uint32]
+    scores: NDArray[np.float32]
+    calibrated: bool = False
+    E: NDArray[np.float64] | None = None
+    F: NDArray[np.float64] | None = None
+    H: NDArray[np.float64] | None = None
+    R: NDArray[np.float64] | None = None
+    t: NDArray[np.float64] | None = None
+    message: str = ""
+
+
+class PairWorker:
+    """The filter and its session, kept for many pairs.
+
+    Args:
+        filter_options: of :class:`mgca_filter.MatchFilter`.
+    """
+
+    def __init__(self, filter_options: dict[str, Any]) -> None:
+        self._filter = MatchFilter(**filter_options)
+
+    def filter(
+        self,
+        name1: str,
+        name2: str,
+        image1: ImageFeatures | None,
+        image2: ImageFeatures | None,
+        matches: NDArray[Any] | None,
+    ) -> PairRow:
+        """Filter the matches (M, 2) of a pair, or nearest neighbours of the descriptors where there are none.
+
+        An image that is None, or matches that point nowhere, give a row ``"failed"``.
+        """
+        if image1 is None or image2 is None:
+            missing = name1 if image1 is None else name2
+            return _failed(name1, name2, f"{missing}: no features, the image cannot be read")
+        try:
+            result, pairs = self._run(image1, image2, matches)
+        except ValueError as error:
+            return _failed(name1, name2, " ".join(str(error).split()))
+        explained = result.status.value in EXPLAINED
+        mask = result.mask & explained
+        return PairRow(
+            name1,
+            name2,
+            result.status.value,
+            len(mask),
+            pairs[mask].astype(np.uint32),
+            result.scores[mask],
+            result.info["intrinsics"] == "given",
+            **({name: getattr(result, name) for name in ("E", "F", "R", "t")} if explained else {}),
+            H=result.info.get("homography") if explained else None,
+        )
+
+    def _run(
+        self, image1: ImageFeatures, image2: ImageFeatures, matches: NDArray[Any] | None
+    ) -> tuple[FilterResult, NDArray[Any]]:
+        """Result and the matches (M, 2) that it is about."""
+        if matches is None:
+            candidates: Any = match_descriptors(_described(image1), _described(image2))
+            pairs = np.array([(c[0].queryIdx, c[0].trainIdx) for c in candidates], dtype=np.intp).reshape(-1, 2)
+            known: MatchAttributes | None = _shapes(image1, image2, pairs)
+        else:
+            candidates, pairs = matches, np.asarray(matches)
+            known = _attributes(image1, image2, pairs)
+        sizes: dict[str, Any] = {"size1": image1.image_size, "size2": image2.image_size, "attributes": known}
+        if image1.K is not None and image2.K is not None:
+            result = self._filter.filter(image1.points, image2.points, candidates, K1=image1.K, K2=image2.K, **sizes)
+            if result.status is not Status.SUSPICIOUS_INTRINSICS:
+                return result, pairs
+        # Without intrinsics, or with such as the matches contradict, F tells the matches apart.
+        return self._filter.filter(image1.points, image2.points, candidates, **sizes), pairs
+
+    def extract(self, name: str, encoded: bytes, detector: str, max_keypoints: int) -> tuple[str, ImageFeatures | None]:
+        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too).
+
+        None in place of the features of a file that cannot be decoded.
+        """
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        try:
+            image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags) if encoded else None
+        except cv2.error:
+            image = None
+        if image is None:
+            return name, None
+        keypoints, descriptors = detect_keypoints(np.asarray(image, np.uint8), create_detector(detector, max_keypoints))
+        values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float32).reshape(-1, 4)
+        height, width = image.shape[:2]
+        return name, ImageFeatures(values[:, :2], values[:, 2], values[:, 3], descriptors, None, (width, height))
+
+
+def _failed(name1: str, name2: str, message: str) -> PairRow:
+    return PairRow(name1, name2, FAILED, 0, np.zeros((0, 2), np.uint32), np.zeros(0, np.float32), message=message)
+
+
+def _described(image: ImageFeatures) -> NDArray[Any]:
+    if image.descriptors is None:
+        raise ValueError("no matches, and no descriptors to find them with")
+    return image.descriptors
+
+
+def _shapes(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes:
+    """Size and angle of each match (M,), where both images know them."""
+    known = {}
+    for side, image, index in ((1, image1, pairs[:, 0]), (2, image2, pairs[:, 1])):
+        if image.size is None or image.angle is None or len(image.points) == 0:
+            return MatchAttributes()
+        known[f"size{side}"], known[f"angle{side}"] = image.size[index], image.angle[index]
+    return MatchAttributes(**known)
+
+
+def _attributes(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes | None:
+    """What the features tell of given matches; None where these are not pairs of indices, for the filter to refuse."""
+    counts = (len(image1.points), len(image2.points))
+    if pairs.ndim != 2 or len(pairs) == 0 or pairs.min() < 0 or (pairs.max(axis=0) >= counts).any():
+        return None
+    shapes = _shapes(image1, image2, pairs)
+    if image1.descriptors is None or image2.descriptors is None or min(counts) < 2:
+        return shapes
+    distance, nearest_other = descriptor_distances(image1.descriptors, image2.descriptors, pairs)
+    return MatchAttributes(
+        ratio=distance_ratio(distance, nearest_other),
+        best=best_of_list(pairs[:, 1].astype(np.intp), distance),
+        size1=shapes.size1,
+        size2=shapes.size2,
+        angle1=shapes.angle1,
+        angle2=shapes.angle2,
+    )
+
+
+def descriptor_distances(
+    descriptors1: NDArray[Any], descriptors2: NDArray[Any], pairs: NDArray[Any], block: int = 1024
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Euclidean distance (M,) of each match, and that (M,) to the nearest other descriptor of image 2.
+
+    Args:
+        descriptors1, descriptors2: (N1, D), (N2, D), N2 of 2 or more. pairs: (M, 2) indices.
+        block: matches at a time, to bound the memory.
+    """
+    all2 = descriptors2.astype(np.float32)
+    square2 = np.sum(all2 * all2, axis=1)
+    matched, other = np.empty(len(pairs)), np.empty(len(pairs))
+    for first in range(0, len(pairs), block):
+        rows = pairs[first : first + block].astype(np.intp)
+        query = descriptors1[rows[:, 0]].astype(np.float32)
+        squared = np.sum(query * query, axis=1)[:, None] + square2 - 2.0 * (query @ all2.T)  # (block, N2)
+        own = np.arange(len(rows)), rows[:, 1]
+        matched[first : first + block] = squared[own]
+        squared[own] = np.inf
+        other[first : first + block] = squared.min(axis=1)
+    return np.sqrt(np.maximum(matched, 0.0)), np.sqrt(np.maximum(other, 0.0))

@@ -1,0 +1,231 @@
+"""COLMAP databases: real pycolmap, real mapper."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+
+import multi_view
+import numpy as np
+import pytest
+from integrations.conftest import assert_one_line
+
+from mgca_filter import cli
+from mgca_filter.epipolar import pose_error_deg, sampson_distance
+
+pycolmap = pytest.importorskip("pycolmap")
+from mgca_filter.integrations import colmap  # noqa: E402
+from mgca_filter.integrations.colmap_compare import compare  # noqa: E402
+from mgca_filter.integrations.pair_worker import PairRow  # noqa: E402
+
+CONFIGURATION = pycolmap.TwoViewGeometryConfiguration
+# Distortion that bends the corners by several pixels, for models with one way to say it.
+MODELS = {
+    "SIMPLE_RADIAL": [512, 320, 240, -0.05],
+    "OPENCV": [512, 515, 320, 240, -0.05, 0.01, 0.001, -0.001],
+    "OPENCV_FISHEYE": [512, 515, 320, 240, 0.02, 0.0, 0.0, 0.0],
+    "FOV": [512, 515, 320, 240, 0.3],
+    "THIN_PRISM_FISHEYE": [512, 515, 320, 240, 0.02, 0, 0, 0, 0, 0, 0.001, 0],
+}
+
+
+@pytest.fixture
+def database(tmp_path, views, raw_matches):
+    return multi_view.write_database(tmp_path / "raw.db", views, raw_matches)
+
+
+def read_geometries(path) -> dict[tuple[int, int], object]:
+    with closing(pycolmap.Database.open(path)) as opened:
+        ids, geometries = opened.read_two_view_geometries()
+    return {pycolmap.pair_id_to_image_pair(pair_id): geometry for pair_id, geometry in zip(ids, geometries)}
+
+
+def true_pose(view1, view2):
+    R = view2.R @ view1.R.T
+    return R, view2.t - R @ view1.t
+
+
+def test_geometry_of_every_pair_is_true(database, views, tmp_path, capsys):
+    """Pose, E, F and inliers in COLMAP's conventions; the input stays as it was, byte for byte."""
+    before = database.read_bytes()
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db")]) == 0
+    assert "6 pairs" in capsys.readouterr().out
+    assert database.read_bytes() == before
+    assert {path.name for path in tmp_path.iterdir()} == {"raw.db", "out.db"}
+    geometries = read_geometries(tmp_path / "out.db")
+    assert len(geometries) == 6
+    half = np.array([0.5, 0.5])
+    for (id1, id2), geometry in geometries.items():
+        view1, view2 = views[id1 - 1], views[id2 - 1]
+        assert geometry.config == CONFIGURATION.CALIBRATED
+        pose = geometry.cam2_from_cam1
+        assert pose_error_deg(pose.rotation.matrix(), pose.translation, *true_pose(view1, view2)) < 2.0
+        rows = geometry.inlier_matches
+        assert len(rows) > 50
+        pixels = np.hstack([view1.points[rows[:, 0]] + half, view2.points[rows[:, 1]] + half])
+        assert (sampson_distance(pixels, geometry.F) < 1.01).all()
+        normalized = (pixels - np.tile(views[0].K[:2, 2] + half, 2)) / 512.0
+        assert (512.0 * sampson_distance(normalized, geometry.E) < 1.01).all()
+
+
+def test_everything_else_is_copied(database, tmp_path):
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    tables = ("cameras", "images", "keypoints", "descriptors", "matches")
+    with closing(sqlite3.connect(database)) as before, closing(sqlite3.connect(tmp_path / "out.db")) as after:
+        for table in tables:
+            query = f"SELECT * FROM {table} ORDER BY 1"
+            assert before.execute(query).fetchall() == after.execute(query).fetchall()
+
+
+def test_in_place_equals_a_copy(database, tmp_path):
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0
+    copied, in_place = read_geometries(tmp_path / "out.db"), read_geometries(database)
+    assert list(copied) == list(in_place)
+    for pair, geometry in copied.items():
+        assert np.array_equal(geometry.inlier_matches, in_place[pair].inlier_matches)
+        assert np.array_equal(geometry.E, in_place[pair].E)
+
+
+def test_threshold_and_descriptors_count(database, tmp_path):
+    """Options that change the answer when they are obeyed."""
+    kept = {}
+    for name, words in {"default": [], "tight": ["--threshold", "0.2"], "bare": ["--no-descriptors"]}.items():
+        assert cli.main(["colmap", str(database), "-o", str(tmp_path / f"{name}.db"), "-q", *words]) == 0
+        kept[name] = [len(g.inlier_matches) for g in read_geometries(tmp_path / f"{name}.db").values()]
+    assert sum(kept["tight"]) < 0.6 * sum(kept["default"])
+    assert kept["bare"] != kept["default"]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_distorted_keypoints_come_back_to_the_pinhole(model):
+    """Project with COLMAP's camera, undistort with ours: the pinhole's pixel, shifted by half a pixel."""
+    camera = pycolmap.Camera(model=model, width=640, height=480, params=MODELS[model])
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-0.5, 0.5, (50, 2)), np.ones(50)])
+    distorted = np.array([camera.img_from_cam(ray) for ray in rays])
+    K = camera.calibration_matrix()
+    pinhole = rays[:, :2] * K[[0, 1], [0, 1]] + K[:2, 2]
+    assert np.abs(distorted - pinhole).max() > 1.0
+    np.testing.assert_allclose(colmap.undistorted(camera, distorted), pinhole - 0.5, atol=1e-3)
+
+
+def test_pairs_of_a_distorted_camera_are_found(tmp_path, views, raw_matches):
+    """Keypoints moved to where a lens would put them, the lens in the database: the poses stay."""
+    path = multi_view.write_database(tmp_path / "raw.db", views, raw_matches)
+    with closing(pycolmap.Database.open(path)) as opened:
+        camera = pycolmap.Camera(model="OPENCV", width=640, height=480, params=[512, 512, 320, 240, -0.2, 0.05, 0, 0])
+        camera.camera_id, camera.has_prior_focal_length = 1, True
+        opened.update_camera(camera)
+        for image_id, view in enumerate(views, 1):
+            table = opened.read_keypoints(image_id)
+            rays = np.column_stack([(view.points - view.K[:2, 2]) / 512.0, np.ones(len(view.points))])
+            table[:, :2] = [camera.img_from_cam(ray) for ray in rays]
+            opened.update_keypoints(image_id, table)
+    assert cli.main(["colmap", str(path), "--in-place", "-q"]) == 0
+    for (id1, id2), geometry in read_geometries(path).items():
+        pose = geometry.cam2_from_cam1
+        truth = true_pose(views[id1 - 1], views[id2 - 1])
+        assert pose_error_deg(pose.rotation.matrix(), pose.translation, *truth) < 2.0
+
+
+def test_without_focal_length_the_pair_is_uncalibrated(database, tmp_path):
+    with closing(pycolmap.Database.open(database)) as opened:
+        camera = opened.read_camera(1)
+        camera.has_prior_focal_length = False
+        opened.update_camera(camera)
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    geometries = read_geometries(tmp_path / "out.db").values()
+    assert CONFIGURATION.UNCALIBRATED in {geometry.config for geometry in geometries}
+    for geometry in geometries:
+        assert geometry.E is None
+        assert geometry.cam2_from_cam1 is None
+
+
+def test_ids_in_the_other_order(tmp_path, views, raw_matches):
+    """Matches written from the larger id to the smaller: COLMAP turns them round, and so do pose and columns."""
+    turned = {(j, i): pairs[:, ::-1] for (i, j), pairs in raw_matches.items()}
+    path = multi_view.write_database(tmp_path / "turned.db", views, turned)
+    assert cli.main(["colmap", str(path), "--in-place", "-q"]) == 0
+    for (id1, id2), geometry in read_geometries(path).items():
+        assert id1 < id2
+        pose = geometry.cam2_from_cam1
+        truth = true_pose(views[id1 - 1], views[id2 - 1])
+        assert pose_error_deg(pose.rotation.matrix(), pose.translation, *truth) < 2.0
+
+
+def test_configuration_follows_status():
+    def row(status, calibrated=True, **matrices):
+        return PairRow(
+            "a", "b", status, 9, np.zeros((0, 2), np.uint32), np.zeros(0, np.float32), calibrated, **matrices
+        )
+
+    H = np.array([[1.0, 0.0, 3.0], [0.0, 1.0, -2.0], [1e-3, 0.0, 1.0]])
+    rotation = colmap.two_view_geometry(row("pure_rotation", R=np.eye(3), H=H))
+    assert rotation.config == CONFIGURATION.PANORAMIC
+    assert (rotation.cam2_from_cam1.translation == 0).all()
+    planar = colmap.two_view_geometry(row("planar", H=H))
+    assert planar.config == CONFIGURATION.PLANAR
+    assert colmap.two_view_geometry(row("planar", calibrated=False)).config == CONFIGURATION.PLANAR_OR_PANORAMIC
+    for status in ("unrelated", "low_support", "no_geometry", "too_few_matches", "failed"):
+        assert colmap.two_view_geometry(row(status)).config == CONFIGURATION.DEGENERATE
+    point = np.array([10.0, 20.0, 1.0])  # COLMAP's pixel; half a pixel less in OpenCV's
+    there, expected = planar.H @ point, H @ (point - [0.5, 0.5, 0.0])
+    np.testing.assert_allclose(there[:2] / there[2], expected[:2] / expected[2] + 0.5)
+
+
+def test_matches_that_point_nowhere_fail_alone(database, tmp_path, capsys):
+    with closing(pycolmap.Database.open(database)) as opened:
+        opened.delete_matches(1, 2)
+        opened.write_matches(1, 2, np.full((30, 2), 99999, np.uint32))
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    assert_one_line(capsys.readouterr(), "99999")
+    with closing(pycolmap.Database.open(tmp_path / "out.db")) as opened:
+        assert opened.read_two_view_geometry(1, 2).config == CONFIGURATION.DEGENERATE
+    geometries = read_geometries(tmp_path / "out.db")  # COLMAP lists those with matches only
+    assert [g.config for g in geometries.values()] == [CONFIGURATION.CALIBRATED] * 5
+
+
+def test_database_locked_by_another_process(database, tmp_path, capsys):
+    with closing(sqlite3.connect(database, isolation_level=None)) as other:
+        other.execute("BEGIN EXCLUSIVE")
+        assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 2
+        assert_one_line(capsys.readouterr(), "raw.db", "locked by another process")
+        other.execute("ROLLBACK")
+    assert read_geometries(database) == {}
+    assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0  # from the journal of the first try
+    assert len(read_geometries(database)) == 6
+
+
+def test_misuse_is_one_line(database, tmp_path, capsys):
+    out = str(tmp_path / "out.db")
+    (tmp_path / "text.db").write_text("hello " * 1000)
+    (tmp_path / "exists.db").write_text("precious")
+    with closing(sqlite3.connect(tmp_path / "other.db")) as other:
+        other.execute("CREATE TABLE t (x)")
+    for arguments, words in (
+        ([str(tmp_path / "missing.db"), "-o", out], ["missing.db"]),
+        ([str(tmp_path / "text.db"), "-o", out], ["text.db", "not a database"]),
+        ([str(tmp_path / "other.db"), "-o", out], ["not a COLMAP database"]),
+        ([str(database)], ["--output", "--in-place"]),
+        ([str(database), "-o", str(database)], ["is the input"]),
+        ([str(database), "-o", str(tmp_path / "exists.db")], ["exists.db", "--overwrite"]),
+        ([str(database), "-o", str(tmp_path / "no" / "out.db")], ["folder does not exist"]),
+        ([str(database), "-o", out, "--truth", str(tmp_path)], ["--compare"]),
+    ):
+        assert cli.main(["colmap", *arguments]) == 2
+        assert_one_line(capsys.readouterr(), *words)
+    assert (tmp_path / "exists.db").read_text() == "precious"
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "exists.db"), "--overwrite", "-q"]) == 0
+
+
+@pytest.mark.slow
+def test_mapper_on_our_geometries_beats_mapper_on_colmaps(database, views, tmp_path):
+    """Four views, four matches of five wrong: as many images or more, at a lower pose error."""
+    assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0
+    truth = multi_view.write_truth(tmp_path / "truth", views)
+    theirs, ours = compare(database, 1.0, truth, workers=1)
+    assert ours.registered_images == len(views)
+    assert ours.registered_images >= theirs.registered_images
+    assert np.median(ours.pose_errors_deg) < np.median(theirs.pose_errors_deg)
+    assert np.median(ours.pose_errors_deg) < 1.0
