@@ -260,6 +260,14 @@ def test_only_outliers_keep_nothing() -> None:
         assert not mask.any()
 
 
+def test_twenty_thousand_points() -> None:
+    many = make_scene(right=14000, wrong=6000)
+    E, mask = findEssentialMat(many.points1, many.points2, K)
+    assert E.shape == (3, 3)
+    assert mask.shape == (20000, 1)
+    assert mask[many.inlier].mean() > 0.9
+
+
 def test_match_mgca_returns_the_kept_matches(scene: Scene) -> None:
     kp1, kp2 = scene.keypoints()
     knn = scene.knn_matches()
