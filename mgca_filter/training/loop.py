@@ -109,6 +109,8 @@ class Trainer:
                         self._validate()
                     if self.step % SAVE_EVERY == 0 or self.step == last:
                         self.save()
+        if self.directory is not None:
+            self.directory.close()
 
     def save(self) -> None:
         """Write checkpoint and averaged weights; a crash in the middle leaves the previous files whole."""

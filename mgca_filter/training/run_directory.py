@@ -52,6 +52,11 @@ class RunDirectory:
         (self.folder / TABLE).write_text(table + "\n", encoding="utf-8")
         draw_curves(self.folder / "curves.png", read_rows(self.folder / LOG), rows)
 
+    def close(self) -> None:
+        """Let TensorBoard's writer go."""
+        if self._tensorboard is not None:
+            self._tensorboard.close()
+
     def _append(self, name: str, group: str, step: int, figures: dict[str, float]) -> None:
         path = self.folder / name
         new = not path.is_file()
