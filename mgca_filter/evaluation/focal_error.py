@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,28 +68,27 @@ def _with_focal(K: NDArray[np.float64], factor: float) -> NDArray[np.float64]:
     return scaled
 
 
-def format_table(outcomes: dict[str, list[FocalOutcome]]) -> str:
-    """One row per assumption: shares of pairs in per cent."""
-    lines = [
-        "| focal length | pairs | mAP@5 | mAP@20 | precision | F within 2 px | suspicious |",
-        "|---|" + "---:|" * 6,
-    ]
-    for name, rows in outcomes.items():
-        errors = [row.error_deg for row in rows]
-        figures = [mean_average_precision(errors, 5), mean_average_precision(errors, 20)]
-        figures += [float(np.mean([getattr(row, f) for row in rows])) for f in ("precision", "close", "suspicious")]
-        lines.append(f"| {name} | {len(rows)} | " + " | ".join(f"{100.0 * value:.1f}" for value in figures) + " |")
-    return "\n".join(lines)
+HEADER = "| focal length | pairs | mAP@5 | mAP@20 | precision | F within 2 px | suspicious |\n|---|" + "---:|" * 6
 
 
-def run(bundles: Sequence[SceneBundle], per_scene: int | None, seed: int, model: Path) -> dict[str, list[FocalOutcome]]:
-    """Outcomes by assumption over the same pairs of all bundles."""
+def format_row(name: str, outcomes: Sequence[FocalOutcome]) -> str:
+    """Means over the pairs under one assumption, per cent."""
+    errors = [outcome.error_deg for outcome in outcomes]
+    figures = [mean_average_precision(errors, 5), mean_average_precision(errors, 20)]
+    figures += [float(np.mean([getattr(row, f) for row in outcomes])) for f in ("precision", "close", "suspicious")]
+    return f"| {name} | {len(outcomes)} | " + " | ".join(f"{100.0 * value:.1f}" for value in figures) + " |"
+
+
+def run(
+    bundles: Sequence[SceneBundle], per_scene: int | None, seed: int, model: Path
+) -> Iterator[tuple[str, list[FocalOutcome]]]:
+    """Assumption by assumption, the outcomes over the same pairs of all bundles."""
     cv2.setNumThreads(1)
     match_filter = MatchFilter(model=model)
-    assumptions: dict[str, float | None] = {f"× {factor:g}": factor for factor in FACTORS}
-    assumptions["not given"] = None
     pairs = [b[i] for b in bundles for i in draw_indices(len(b), b.scene, per_scene, seed)]
-    return {name: [run_pair(p, factor, match_filter) for p in pairs] for name, factor in assumptions.items()}
+    for factor in (*FACTORS, None):
+        name = "not given" if factor is None else f"× {factor:g}"
+        yield name, [run_pair(pair, factor, match_filter) for pair in pairs]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -101,11 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default 0)")
     options = parser.parse_args(arguments)
     try:
-        outcomes = run(load_scene_bundles(options.bundles), options.per_scene, options.seed, options.model)
+        bundles = load_scene_bundles(options.bundles)
+        print(HEADER)
+        for name, outcomes in run(bundles, options.per_scene, options.seed, options.model):
+            print(format_row(name, outcomes), flush=True)
     except MgcaFilterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(format_table(outcomes))
     return 0
 
 
