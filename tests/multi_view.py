@@ -1,4 +1,4 @@
-"""A rendered scene in many views with exact poses, and COLMAP databases of it: raw nearest neighbours, most wrong."""
+"""The rendered views of ``examples/render_views.py`` with features, raw matches, and COLMAP databases of them."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ import numpy as np
 from mgca_filter.keypoints import create_detector, detect_keypoints
 from mgca_filter.matching import match_descriptors
 
-_SIZE, _FOCAL_PX = (640, 480), 512.0
 
-
-def _load_renderer():
-    path = Path(__file__).parent.parent / "examples" / "render_pair.py"
-    spec = importlib.util.spec_from_file_location("render_pair", path)
+def _load_example():
+    path = Path(__file__).parent.parent / "examples" / "render_views.py"
+    spec = importlib.util.spec_from_file_location("render_views", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module
+
+
+example = _load_example()
 
 
 @dataclass(frozen=True)
@@ -32,31 +33,25 @@ class View:
 
     name: str
     image: np.ndarray
-    keypoints: list[cv2.KeyPoint]
-    descriptors: np.ndarray
     K: np.ndarray
     R: np.ndarray
     t: np.ndarray
+    keypoints: list[cv2.KeyPoint]
+    descriptors: np.ndarray
 
     @property
     def points(self) -> np.ndarray:
         return np.array([k.pt for k in self.keypoints])
 
 
-def render_views(count: int = 8, supersampling: int = 1, max_keypoints: int = 1500) -> list[View]:
-    """The courtyard of the example pair from ``count`` places on an arc, far enough apart to be hard."""
-    renderer = _load_renderer()
-    faces, detector = renderer.courtyard(), create_detector("sift", max_keypoints)
-    views = []
-    for k, a in enumerate(np.linspace(-1.0, 1.0, count)):
-        position = (5.2 * a, -0.5 + 0.4 * np.sin(3 * k), 1.6 * a * a - 1.2 + 0.8 * np.cos(2.1 * k))
-        camera = renderer.look_at(position, (0.3 * np.sin(k), -0.3, 7.5), 15 * np.sin(1.7 * k), _FOCAL_PX, _SIZE)
-        image = renderer.render(faces, camera, supersampling)
-        gains = 0.9 + 0.15 * np.sin([k, 2 * k, 3 * k])
-        image = renderer.expose(image, gains, 1.0 + 0.25 * np.cos(k), 0.7 + 0.3 * (k % 3), 0.05, seed=k)
-        keypoints, descriptors = detect_keypoints(image, detector)
-        views.append(View(f"view{k:02d}.png", image, keypoints, descriptors, camera.K, camera.R, camera.t))
-    return views
+def render_views(count: int, supersampling: int = 1, max_keypoints: int = 1500) -> list[View]:
+    """Views with SIFT features."""
+    detector = create_detector("sift", max_keypoints)
+    rendered = example.render_views(count, supersampling)
+    return [
+        View(**vars(v), **dict(zip(("keypoints", "descriptors"), detect_keypoints(v.image, detector))))
+        for v in rendered
+    ]
 
 
 def raw_matches(views: list[View]) -> dict[tuple[int, int], np.ndarray]:
@@ -73,7 +68,8 @@ def write_database(path: Path, views: list[View], matches: dict[tuple[int, int],
 
     database = pycolmap.Database.open(path)
     fx, fy, cx, cy = views[0].K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    camera = pycolmap.Camera(model="PINHOLE", width=_SIZE[0], height=_SIZE[1], params=[fx, fy, cx + 0.5, cy + 0.5])
+    height, width = views[0].image.shape[:2]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=[fx, fy, cx + 0.5, cy + 0.5])
     camera.has_prior_focal_length = True
     camera_id = database.write_camera(camera)
     ids = []
@@ -92,15 +88,5 @@ def write_database(path: Path, views: list[View], matches: dict[tuple[int, int],
 
 def write_truth(folder: Path, views: list[View]) -> Path:
     """The true poses as a COLMAP model in ``folder``."""
-    import pycolmap
-
-    folder.mkdir()
-    fx, fy, cx, cy = views[0].K[[0, 1, 0, 1], [0, 1, 2, 2]]
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {_SIZE[0]} {_SIZE[1]} {fx} {fy} {cx + 0.5} {cy + 0.5}\n")
-    lines = []
-    for k, view in enumerate(views, 1):
-        x, y, z, w = pycolmap.Rotation3d(view.R).quat
-        lines.append(f"{k} {w} {x} {y} {z} {view.t[0]} {view.t[1]} {view.t[2]} 1 {view.name}\n\n")
-    (folder / "images.txt").write_text("".join(lines))
-    (folder / "points3D.txt").write_text("")
+    example.write_truth(folder, views)
     return folder

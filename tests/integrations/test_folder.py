@@ -1,0 +1,246 @@
+"""Folders of images: pair lists, outputs, resume after a kill, broken images, full disks."""
+
+from __future__ import annotations
+
+import json
+import resource
+import signal
+import sqlite3
+import time
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from integrations.conftest import K_WORDS, assert_one_line, start_command
+
+from mgca_filter import cli, match_images
+from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.integrations.folder_pairs import exhaustive_pairs, sequential_pairs
+
+OPTIONS = ["--K", K_WORDS, "-q"]
+
+
+def run(folder, output, *words) -> int:
+    return cli.main(["folder", str(folder), "-o", str(output), *OPTIONS, *map(str, words)])
+
+
+def read_rows(path) -> list[dict]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def expected(tmp_path_factory, views):
+    """Rows of one uninterrupted run in one process."""
+    folder = tmp_path_factory.mktemp("expected")
+    (folder / "images").mkdir()
+    for view in views:
+        cv2.imwrite(str(folder / "images" / view.name), view.image)
+    assert run(folder / "images", folder / "out.jsonl") == 0
+    return (folder / "out.jsonl").read_text()
+
+
+def test_rows_equal_match_images(image_folder, views, expected):
+    """The pipeline is the public door, pair by pair."""
+    rows = [json.loads(line) for line in expected.splitlines()]
+    assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
+    for row in rows:
+        view1, view2 = (next(v for v in views if v.name == row[key]) for key in ("image1", "image2"))
+        alone = match_images(view1.image, view2.image, K1=view1.K)
+        assert row["status"] == alone.result.status.value
+        assert row["num_inliers"] == alone.result.num_inliers == len(row["points1"]) == len(row["scores"])
+        np.testing.assert_allclose(row["R"], alone.result.R, atol=1e-9)
+        R = view2.R @ view1.R.T
+        assert pose_error_deg(row["R"], row["t"], R, view2.t - R @ view1.t) < 2.0
+
+
+def test_processes_give_the_same_rows(image_folder, tmp_path, expected):
+    assert run(image_folder, tmp_path / "out.jsonl", "-j", 2) == 0
+    assert (tmp_path / "out.jsonl").read_text() == expected
+
+
+def test_pair_choices(image_folder, tmp_path):
+    names = [f"view{k:02d}.png" for k in range(4)]
+    assert sequential_pairs(names, 2) == [p for p in exhaustive_pairs(names) if int(p[1][5]) - int(p[0][5]) <= 2]
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("# a comment\n\nview02.png view00.png\nview00.png\tview02.png\nview01.png  view03.png\n")
+    assert run(image_folder, tmp_path / "listed.jsonl", "--pairs", pairs) == 0
+    listed = [(row["image1"], row["image2"]) for row in read_rows(tmp_path / "listed.jsonl")]
+    assert listed == [("view01.png", "view03.png"), ("view02.png", "view00.png")]
+    assert run(image_folder, tmp_path / "s.jsonl", "--pairs", "sequential", "--overlap", 1) == 0
+    assert len(read_rows(tmp_path / "s.jsonl")) == 3
+
+
+def test_options_are_obeyed(image_folder, tmp_path, expected):
+    few = ["--pairs", "sequential", "--overlap", 1]
+    assert run(image_folder, tmp_path / "few.jsonl", *few, "--max-keypoints", 500) == 0
+    assert max(row["num_matches"] for row in read_rows(tmp_path / "few.jsonl")) <= 501
+    assert run(image_folder, tmp_path / "orb.jsonl", *few, "--detector", "orb") in (0, 1)
+    assert read_rows(tmp_path / "orb.jsonl")[0]["points1"] != json.loads(expected.splitlines()[0])["points1"]
+    assert cli.main(["folder", str(image_folder), "-o", str(tmp_path / "no_K.jsonl"), "-q", *map(str, few)]) == 0
+    assert not any(row["calibrated"] for row in read_rows(tmp_path / "no_K.jsonl"))
+
+
+def test_cache_is_used_and_follows_the_images(image_folder, tmp_path):
+    few = ["--pairs", "sequential", "--overlap", 1, "--cache", tmp_path / "cache"]
+    assert run(image_folder, tmp_path / "a.jsonl", *few) == 0
+    stamps = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()}
+    assert len(stamps) == 4
+    assert run(image_folder, tmp_path / "b.jsonl", *few) == 0
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").iterdir()} == stamps
+    changed = image_folder / "view00.png"
+    changed.write_bytes((image_folder / "view03.png").read_bytes())
+    assert run(image_folder, tmp_path / "c.jsonl", *few) == 0
+    assert len(list((tmp_path / "cache").iterdir())) == 5
+
+
+def test_corrupt_image_costs_its_own_pairs_only(image_folder, tmp_path, capsys, expected):
+    (image_folder / "broken.jpg").write_bytes(b"\xff\xd8\xff\xe0 no image")
+    (image_folder / "empty.png").touch()
+    assert run(image_folder, tmp_path / "out.jsonl") == 0
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "broken.jpg: no features" in captured.err
+    assert "empty.png: no features" in captured.err
+    rows = read_rows(tmp_path / "out.jsonl")
+    healthy = [row for row in rows if row["status"] != "failed"]
+    assert healthy == [json.loads(line) for line in expected.splitlines()]
+    assert len(rows) - len(healthy) == 9
+
+
+def test_exit_status_without_any_geometry(tmp_path):
+    folder = tmp_path / "noise"
+    folder.mkdir()
+    for seed in range(2):
+        noise = np.random.default_rng(seed).integers(0, 255, (120, 160), dtype=np.uint8)
+        cv2.imwrite(str(folder / f"{seed}.png"), noise)
+    assert run(folder, tmp_path / "out.jsonl") == 1
+    (row,) = read_rows(tmp_path / "out.jsonl")
+    assert row["points1"] == []
+    assert row["E"] is None
+
+
+def test_misuse_is_one_line(image_folder, tmp_path, capsys):
+    pairs = tmp_path / "pairs.txt"
+    for text, words in (
+        ("view00.png view01.png\nview00.png missing.png\n", ["pairs.txt:2", "missing.png is not in"]),
+        ("view00.png\n", ["pairs.txt:1", "two names"]),
+        ("view00.png view00.png\n", ["pairs.txt:1"]),
+        ("", ["no pairs"]),
+    ):
+        pairs.write_text(text)
+        assert run(image_folder, tmp_path / "out.jsonl", "--pairs", pairs) == 2
+        assert_one_line(capsys.readouterr(), *words)
+    for words, message in (
+        (["folder", str(image_folder), "-o", str(tmp_path / "out.txt")], ".jsonl"),
+        (["folder", str(tmp_path / "missing"), "-o", str(tmp_path / "out.jsonl")], "no such folder"),
+        (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "--address", "auto"], "--engine ray"),
+        (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "-j", "0"], "--jobs"),
+        (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "--pairs", "none.txt"], "none.txt"),
+    ):
+        assert cli.main(words) == 2
+        assert_one_line(capsys.readouterr(), message)
+
+
+def test_a_file_of_the_subcommands_name_is_an_image(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").write_bytes(b"no image")
+    assert cli.main(["folder", "folder"]) == 2
+    assert_one_line(capsys.readouterr(), "folder: not an image")
+
+
+def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected):
+    """kill -9 after the first rows: the second run does the others only, and gives the same file."""
+    output, journal = tmp_path / "out.jsonl", tmp_path / "out.jsonl.work" / "journal.db"
+    process = start_command("folder", image_folder, "-o", output, *OPTIONS)
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and process.poll() is None and journal_rows(journal) < 2:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    done = journal_rows(journal)
+    assert 2 <= done < 6
+    assert not output.exists()
+    second = start_command("folder", image_folder, "-o", output, *OPTIONS[:-1])
+    out, err = second.communicate()
+    assert second.returncode == 0, err
+    assert f"({done} were done before)" in out
+    assert output.read_text() == expected
+    assert not journal.exists()
+
+
+def journal_rows(path) -> int:
+    """Rows in a journal, from its write-ahead log: the run holds the lock while it lives."""
+    log = path.with_name(path.name + "-wal")
+    if not log.exists():
+        return 0
+    copy = path.with_name("look.db")
+    for suffix in ("", "-wal"):
+        copy.with_name(copy.name + suffix).write_bytes(path.with_name(path.name + suffix).read_bytes())
+    try:
+        with sqlite3.connect(copy) as database:
+            return database.execute("SELECT COUNT(*) FROM pair_rows").fetchone()[0]
+    except sqlite3.Error:
+        return 0
+
+
+def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
+    from mgca_filter.integrations.journal import Journal
+
+    (tmp_path / "out.jsonl.work").mkdir()
+    journal = Journal(tmp_path / "out.jsonl.work" / "journal.db")
+    journal.begin({"threshold": 2.0})
+    assert run(image_folder, tmp_path / "out.jsonl") == 2
+    assert_one_line(capsys.readouterr(), "journal.db", "locked by another process")
+    journal.close()
+    assert run(image_folder, tmp_path / "out.jsonl") == 2
+    assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 2.0 instead of 1.0")
+
+
+def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path, expected):
+    """A limit on the size of files stands for the full disk: the output does not fit, the rows are kept."""
+    output = tmp_path / "out.jsonl"
+    limit = 100_000
+    assert len(expected) > limit
+
+    def little_disk() -> None:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+
+    cache = ["--cache", tmp_path / "cache"]
+    assert run(image_folder, tmp_path / "first.jsonl", *cache) == 0
+    process = start_command("folder", image_folder, "-o", output, *OPTIONS, *cache, preexec_fn=little_disk)
+    out, err = process.communicate()
+    assert process.returncode == 2
+    assert err.count("\n") == 1, err
+    assert "out.jsonl" in err
+    assert not output.exists()
+    assert not output.with_name("out.jsonl.partial").exists()
+    assert run(image_folder, output, *cache) == 0
+    assert output.read_text() == expected
+
+
+def test_hloc_output_is_read_by_the_hloc_command(image_folder, tmp_path, expected):
+    (image_folder / "broken.jpg").write_bytes(b"no image")
+    assert run(image_folder, tmp_path / "m.h5") == 0
+    rows = [json.loads(line) for line in expected.splitlines()]
+    with h5py.File(tmp_path / "m.h5") as matches, h5py.File(tmp_path / "m.features.h5") as features:
+        for row in rows:
+            group = matches[row["image1"]][row["image2"]]
+            first = np.flatnonzero(group["matches0"][()] > -1)
+            np.testing.assert_array_equal(features[row["image1"]]["keypoints"][()][first], np.float32(row["points1"]))
+            second = group["matches0"][()][first]
+            np.testing.assert_array_equal(features[row["image2"]]["keypoints"][()][second], np.float32(row["points2"]))
+            np.testing.assert_allclose(group["matching_scores0"][()][first], row["scores"], atol=1e-3)
+    words = [tmp_path / "m.features.h5", tmp_path / "m.h5", "-o", tmp_path / "f.h5", "-q"]
+    assert cli.main(["hloc", *map(str, words)]) == 0
+
+
+def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    assert run(image_folder, tmp_path / "out.db") == 0
+    options = pycolmap.IncrementalPipelineOptions()
+    options.extract_colors, options.min_model_size = False, 3
+    (tmp_path / "model").mkdir()
+    models = pycolmap.incremental_mapping(tmp_path / "out.db", image_folder, tmp_path / "model", options)
+    assert max(model.num_reg_images() for model in models.values()) == 4
