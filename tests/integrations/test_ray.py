@@ -24,6 +24,7 @@ def paths(monkeypatch):
     root = os.path.dirname(os.path.dirname(os.path.dirname(__file__)))
     monkeypatch.setenv("PYTHONPATH", root)
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 starves on a busy machine
 
 
 def test_ray_gives_the_rows_of_one_process(paths, image_folder, tmp_path):
