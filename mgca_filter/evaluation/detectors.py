@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -97,31 +97,32 @@ def _rescaled(K: NDArray[np.float64], size: tuple[int, int], now: tuple[int, int
 
 def run(
     images: Path, bundle: SceneBundle, names: Sequence[str], per_scene: int | None, seed: int, model: Path
-) -> dict[str, dict[str, list[float]]]:
-    """Pose errors by detector and method, over the bundle's pairs of which both photographs are in the folder."""
+) -> Iterator[tuple[str, dict[str, list[float]]]]:
+    """Detector by detector, pose errors by method, over the pairs of which both photographs are in the folder."""
     cv2.setNumThreads(1)
     match_filter = MatchFilter(model=model)
     indices = draw_indices(len(bundle), bundle.scene, per_scene, seed)
     pairs = [p for p in (bundle[i] for i in indices) if (images / p.image1).exists() and (images / p.image2).exists()]
-    errors: dict[str, dict[str, list[float]]] = {}
     for name in names:
         detector = make_detector(name)
         features: Callable[[str], Features] = cache(lambda image: read_features(images / image, detector))  # noqa: B023
-        rows = errors.setdefault(name, {})
+        errors: dict[str, list[float]] = {}
         for pair in pairs:
             one, two = features(pair.image1), features(pair.image2)
             for method, error in errors_of_pair(one, two, detector.defaultNorm(), pair, match_filter).items():
-                rows.setdefault(method, []).append(error)
-    return errors
+                errors.setdefault(method, []).append(error)
+        yield name, errors
 
 
-def format_table(errors: dict[str, dict[str, list[float]]]) -> str:
-    """One row per detector and method: shares of pairs in per cent."""
-    lines = ["| detector | method | pairs | mAP@5 | mAP@20 |", "|---|---|---:|---:|---:|"]
-    for detector, methods in errors.items():
-        for method, values in methods.items():
-            figures = [100.0 * mean_average_precision(values, limit) for limit in (5, 20)]
-            lines.append(f"| {detector} | {method} | {len(values)} | {figures[0]:.1f} | {figures[1]:.1f} |")
+HEADER = "| detector | method | pairs | mAP@5 | mAP@20 |\n|---|---|---:|---:|---:|"
+
+
+def format_rows(detector: str, errors: dict[str, list[float]]) -> str:
+    """One row per method: shares of pairs in per cent."""
+    lines = []
+    for method, values in errors.items():
+        figures = [100.0 * mean_average_precision(values, limit) for limit in (5, 20)]
+        lines.append(f"| {detector} | {method} | {len(values)} | {figures[0]:.1f} | {figures[1]:.1f} |")
     return "\n".join(lines)
 
 
@@ -137,11 +138,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         bundle = SceneBundle(options.bundle)
-        errors = run(options.images, bundle, options.detectors, options.per_scene, options.seed, options.model)
+        print(HEADER)
+        arguments = (options.images, bundle, options.detectors, options.per_scene, options.seed, options.model)
+        for detector, errors in run(*arguments):
+            print(format_rows(detector, errors), flush=True)
     except (MgcaFilterError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    print(format_table(errors))
     return 0
 
 
