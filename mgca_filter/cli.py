@@ -218,7 +218,7 @@ def _log_to_stderr(level: int) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
     words = sys.argv[1:] if arguments is None else arguments
-    if words and words[0] in SUBCOMMANDS and not Path(words[0]).exists():
+    if words and words[0] in SUBCOMMANDS and not Path(words[0]).is_file():
         from .integrations.command import main as run_subcommand
 
         return run_subcommand(words)

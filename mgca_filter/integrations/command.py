@@ -188,7 +188,7 @@ def main(arguments: Sequence[str]) -> int:
         words = f"{error.filename}: {error.strerror}" if error.filename else " ".join(str(error).split())
         print(f"mgca-match: {words}", file=sys.stderr)
         return EXIT_USAGE
-    except (UsageError, MgcaFilterError, ValueError, TypeError) as error:
+    except (UsageError, MgcaFilterError, ValueError, TypeError, RuntimeError) as error:  # the last: pycolmap, HDF5
         print(f"mgca-match: {' '.join(str(error).split())}", file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:

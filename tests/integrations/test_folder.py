@@ -147,6 +147,10 @@ def test_a_file_of_the_subcommands_name_is_an_image(tmp_path, monkeypatch, capsy
     (tmp_path / "folder").write_bytes(b"no image")
     assert cli.main(["folder", "folder"]) == 2
     assert_one_line(capsys.readouterr(), "folder: not an image")
+    (tmp_path / "folder").unlink()
+    (tmp_path / "folder").mkdir()
+    assert cli.main(["folder", "folder", "-o", "out.jsonl"]) == 2
+    assert_one_line(capsys.readouterr(), "folder: no images")
 
 
 def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected):
