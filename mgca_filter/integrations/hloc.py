@@ -56,7 +56,7 @@ class HlocJob:
             try:
                 journal.begin({"inputs": inputs, "descriptors": self.use_descriptors, **filter_options})
                 summary = run_pairs(source, engine, journal, quiet)
-                with replaced_when_done(self.output) as partial, write_errors(self.output):
+                with replaced_when_done(self.output) as partial:
                     shutil.copyfile(self.matches, partial)
                     with h5py.File(partial, "r+") as filtered:
                         drop_matches(filtered, source.groups, journal.rows())
@@ -83,18 +83,6 @@ def opened(path: Path) -> Iterator[Any]:
         raise PipelineError(f"{path}: {words}") from error
     with file:
         yield file
-
-
-@contextmanager
-def write_errors(path: Path) -> Iterator[None]:
-    """HDF5's exceptions while writing as one line that names the file."""
-    try:
-        yield
-    except (OSError, RuntimeError) as error:
-        raise PipelineError(
-            f"{path}: cannot be written ({' '.join(str(error).split())}); what is finished is kept, run the command "
-            "again to go on"
-        ) from error
 
 
 class HlocSource:

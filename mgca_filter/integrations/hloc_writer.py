@@ -8,13 +8,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from .hloc import write_errors
 from .pair_worker import FAILED, ImageFeatures, PairRow
 
 
 def write_features(path: Path, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> None:
     """Keypoints, scales, orientations (degrees), descriptors and image size of each image that has features."""
-    with write_errors(path), h5py.File(path, "w") as file:
+    with h5py.File(path, "w") as file:
         for name in names:
             image = read(name)
             if image is None or image.size is None or image.angle is None or image.descriptors is None:
@@ -28,7 +27,7 @@ def write_features(path: Path, names: Sequence[str], read: Callable[[str], Image
 
 def write_matches(path: Path, read: Callable[[str], ImageFeatures | None], rows: Iterable[PairRow]) -> None:
     """Kept matches and their scores of each pair, in the new layout; failed pairs are left out."""
-    with write_errors(path), h5py.File(path, "w") as file:
+    with h5py.File(path, "w") as file:
         for row in rows:
             image = None if row.status == FAILED else read(row.name1)
             if image is None:

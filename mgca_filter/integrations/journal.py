@@ -148,12 +148,21 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replaced_when_done(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, moved there when the block ends well and removed when it does not."""
+    """A temporary name beside ``path``, moved there when the block ends well and removed when it does not.
+
+    Raises:
+        PipelineError: writing fails, with an exception of the system or of HDF5.
+    """
     temporary = path.with_name(path.name + ".partial")
     try:
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(path)
+    except (OSError, RuntimeError) as error:
+        words = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise PipelineError(
+            f"{path}: cannot be written ({words}); what is finished is kept, run the command again to go on"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
