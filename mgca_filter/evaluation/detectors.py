@@ -139,8 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         bundle = SceneBundle(options.bundle)
         print(HEADER)
-        arguments = (options.images, bundle, options.detectors, options.per_scene, options.seed, options.model)
-        for detector, errors in run(*arguments):
+        settings = (options.detectors, options.per_scene, options.seed, options.model)
+        for detector, errors in run(options.images, bundle, *settings):
             print(format_rows(detector, errors), flush=True)
     except (MgcaFilterError, ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
