@@ -240,6 +240,7 @@ def test_hloc_output_is_read_by_the_hloc_command(image_folder, tmp_path, expecte
     assert cli.main(["hloc", *map(str, words)]) == 0
 
 
+@pytest.mark.slow
 def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
     pycolmap = pytest.importorskip("pycolmap")
     assert run(image_folder, tmp_path / "out.db") == 0
