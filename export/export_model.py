@@ -45,17 +45,23 @@ def main() -> int:
         calibration=Calibration(*options.calibration),
     )
     onnx_path, torch_path = export_model(load_network(options.weights), options.folder, description)
+    _record_checksums(options.folder)
     rows = check_parity(onnx_path, torch_path)
     print(format_parity(rows))
     print(f"{onnx_path} ({onnx_path.stat().st_size / 2**20:.2f} MiB)")
     if options.half_weights:
         half_path = onnx_path.with_name(f"{options.name}_half.onnx")
         halve_weights(onnx_path, half_path)
+        _record_checksums(options.folder)
         print(format_parity(check_parity(half_path, torch_path)))
         print(f"{half_path} ({half_path.stat().st_size / 2**20:.2f} MiB)")
-    if (options.folder / SUMS_NAME).exists():
-        record_checksums(options.folder)
     return 0 if all(row.passed for row in rows) else 1
+
+
+def _record_checksums(folder: Path) -> None:
+    """Renew the checksums where a folder keeps them, before the files are opened."""
+    if (folder / SUMS_NAME).exists():
+        record_checksums(folder)
 
 
 if __name__ == "__main__":

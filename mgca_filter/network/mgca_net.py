@@ -12,6 +12,7 @@ from .attention import ContextGraphAttention
 from .config import ATTRIBUTE_CHANNELS, NetworkConfig
 from .consensus import CrossStageConsensus, FinalConsensus
 from .eight_point import MINIMUM_POINTS, residual_channel, weighted_eight_point
+from .essential_refinement import refine_essential
 from .graph import GraphBlock
 from .order_aware import OrderAwareBlock
 from .point_cn import PointCN
@@ -148,6 +149,7 @@ class MGCANet(nn.Module):
     2. stages 2 and 3 see, besides, the epipolar residual of the previous essential matrix and
        relu(tanh(previous logits)), both detached
     3. final consensus over the outputs of all stages gives the answer
+    4. outside training, the essential matrix of the answer is refined on its manifold
 
     Feature maps are (B, N, C) inside: products with matches as rows, gathers of whole rows, no transposes.
     """
@@ -183,7 +185,10 @@ class MGCANet(nn.Module):
         if self.final is not None:
             agreed = self.final([stage.output for stage in features])
             heads.append(self.final_head(agreed, prior, correspondences))
-        return NetworkOutput(heads[-1].logits, heads[-1].essential, heads)
+        essential = heads[-1].essential
+        if not self.training:
+            essential = refine_essential(correspondences, heads[-1].logits, essential)
+        return NetworkOutput(heads[-1].logits, essential, heads)
 
     @staticmethod
     def _feedback(correspondences: Tensor, previous: HeadOutput) -> list[Tensor]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from mgca_filter.network import PRESETS, MGCANet, NetworkConfig
 from mgca_filter.network.eight_point import residual_channel
+from mgca_filter.network.essential_refinement import refine_essential
 from mgca_filter.network.mgca_net import Head, better_half
 from mgca_filter.network.weights import count_parameters
 
@@ -87,10 +88,15 @@ def test_the_prior_is_added_to_every_head():
 @pytest.mark.parametrize(("stages", "heads"), [(1, 1), (2, 3), (3, 4)])
 def test_every_stage_and_the_final_consensus_have_a_head(stages, heads):
     network = tiny_network(dataclasses.replace(TINY, stages=stages))
-    output = network(*two_view_batch(20))
+    correspondences, attributes = two_view_batch(20)
+    output = network(correspondences, attributes)
     assert len(output.heads) == heads
     assert output.heads[-1].logits is output.logits
-    assert output.heads[-1].essential is output.essential
+    refined = refine_essential(correspondences, output.logits, output.heads[-1].essential)
+    torch.testing.assert_close(output.essential, refined)
+    network.train()
+    output = network(correspondences, attributes)
+    assert output.essential is output.heads[-1].essential
 
 
 def test_all_switches_are_covered():
