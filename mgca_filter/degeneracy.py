@@ -23,7 +23,7 @@ from .homography import homography_distance
 
 Array = NDArray[np.float64]
 
-MIN_SUPPORT = 12
+MIN_SUPPORT = 15
 # Number of false alarms, log10: above the first the support is chance, above the second it is weak.
 UNRELATED_LOG10_NFA = 0.5
 LOW_SUPPORT_LOG10_NFA = -3.0
