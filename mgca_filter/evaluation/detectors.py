@@ -89,6 +89,10 @@ def errors_of_pair(
     }
 
 
+def _both_exist(images: Path, pair: ScenePair) -> bool:
+    return all((images / name).exists() for name in (pair.image1, pair.image2))
+
+
 def _rescaled(K: NDArray[np.float64], size: tuple[int, int], now: tuple[int, int]) -> NDArray[np.float64]:
     """Intrinsics of a picture that was ``size`` and is ``now``: pixels are areas, their centres shift by halves."""
     sx, sy = now[0] / size[0], now[1] / size[1]
@@ -101,8 +105,8 @@ def run(
     """Detector by detector, pose errors by method, over the pairs of which both photographs are in the folder."""
     cv2.setNumThreads(1)
     match_filter = MatchFilter(model=model)
-    indices = draw_indices(len(bundle), bundle.scene, per_scene, seed)
-    pairs = [p for p in (bundle[i] for i in indices) if (images / p.image1).exists() and (images / p.image2).exists()]
+    there = [p for p in map(bundle.__getitem__, range(len(bundle))) if _both_exist(images, p)]
+    pairs = [there[i] for i in draw_indices(len(there), bundle.scene, per_scene, seed)]
     for name in names:
         detector = make_detector(name)
         features: Callable[[str], Features] = cache(lambda image: read_features(images / image, detector))  # noqa: B023
