@@ -45,6 +45,8 @@ class Start:
 # Estimators stop at the first model that looks good enough and miss better ones; what they see decides which they
 # meet. Four views of the matches, and the choice by support, find most of what any one of them would.
 STARTS = (Start(0.0, 2.0), Start(-1.0, 1.0), Start(-1.0, 2.0), Start(-2.0, 1.0))
+# PoseLib samples more thoroughly and takes longer: two are enough.
+POSELIB_STARTS = (STARTS[0], STARTS[3])
 SINGLE_START = (Start(),)
 
 
@@ -58,7 +60,7 @@ class RobustFitOptions:
         confidence: probability that a sample without outliers was drawn.
         max_iterations: largest number of samples of a start.
         seed: of the estimator's random numbers.
-        starts: runs of the estimator, of which the best-supported model is kept.
+        starts: runs of the estimator, of which the best-supported model is kept; None = those that suit the method.
         refine: finish with least squares on the pose, from these models and from the dominant plane's.
         refine_threshold_px: where refinement and support cut the error off, pixels.
     """
@@ -68,13 +70,20 @@ class RobustFitOptions:
     confidence: float = 0.9999
     max_iterations: int = 5000
     seed: int = 0
-    starts: tuple[Start, ...] = STARTS
+    starts: tuple[Start, ...] | None = None
     refine: bool = True
     refine_threshold_px: float = 1.0
 
+    @property
+    def runs(self) -> tuple[Start, ...]:
+        """The starts, or those that suit the method."""
+        if self.starts is not None:
+            return self.starts
+        return POSELIB_STARTS if self.method == "poselib" else STARTS
+
     def estimator(self, index: int) -> EstimatorOptions:
         """What start number ``index`` tells the estimator; each draws other samples."""
-        threshold_px = self.starts[index].threshold_factor * self.threshold_px
+        threshold_px = self.runs[index].threshold_factor * self.threshold_px
         return EstimatorOptions(self.method, threshold_px, self.confidence, self.max_iterations, self.seed + index)
 
 
@@ -129,7 +138,7 @@ def estimate_model(
     if len(matches.correspondences) < MIN_MATCHES:
         return None
     found = []
-    for index, start in enumerate(options.starts):
+    for index, start in enumerate(options.runs):
         seen = matches.above(start.margin).correspondences
         M = fit_epipolar(seen, focal_px, options.estimator(index), calibrated)
         if M is not None:
@@ -146,7 +155,7 @@ def _best_calibrated(
     threshold = options.refine_threshold_px / focal_px
     poses = []
     for M, index in found:
-        start = matches.above(options.starts[index].margin).correspondences
+        start = matches.above(options.runs[index].margin).correspondences
         pose = pose_from_essential(project_to_essential(M), start[sampson_distance(start, M) < threshold])
         if pose is None:
             continue
@@ -170,7 +179,7 @@ def _best_uncalibrated(
         return None
     threshold = options.refine_threshold_px / focal_px
     M, index = max(found, key=lambda item: matches.support(item[0], threshold))
-    accepted = matches.above(options.starts[index].margin).correspondences
+    accepted = matches.above(options.runs[index].margin).correspondences
     E = project_to_essential(M)
     pose = pose_from_essential(E, accepted[sampson_distance(accepted, M) < threshold])
     return None if pose is None else TwoViewModel(M, E, *pose, origin=f"start {index + 1}")

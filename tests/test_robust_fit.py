@@ -192,6 +192,12 @@ def test_support_counts_weights_agreement_and_depth(scene: Scene) -> None:
     assert ranked.pose_support(exact.R, -exact.t, 0.01) == pytest.approx(0.0)
 
 
+def test_every_method_has_its_starts_unless_told_otherwise() -> None:
+    assert len(RobustFitOptions().runs) > len(RobustFitOptions(method="poselib").runs) > 1
+    assert RobustFitOptions(method="poselib", starts=SINGLE_START).runs == SINGLE_START
+    assert [RobustFitOptions(seed=5).estimator(index).seed for index in (0, 2)] == [5, 7]
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_the_best_supported_start_wins(calibrated: bool) -> None:
     hard = make_scene(right=60, wrong=600)
