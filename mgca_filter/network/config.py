@@ -31,7 +31,7 @@ class NetworkConfig:
 
     channels: int = 64
     clusters: int = 128
-    stages: int = 2
+    stages: int = 3
     neighbours: int = 6
     graph_expansion: int = 1
     attention: Literal["channel", "point"] = "channel"
