@@ -2,6 +2,15 @@
 
 from .config import PRESETS, NetworkConfig
 from .mgca_net import HeadOutput, MGCANet, NetworkOutput
-from .weights import load_network, save_network
+from .weights import load_network, save_network, transfer_weights
 
-__all__ = ["PRESETS", "HeadOutput", "MGCANet", "NetworkConfig", "NetworkOutput", "load_network", "save_network"]
+__all__ = [
+    "PRESETS",
+    "HeadOutput",
+    "MGCANet",
+    "NetworkConfig",
+    "NetworkOutput",
+    "load_network",
+    "save_network",
+    "transfer_weights",
+]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,6 +14,8 @@ from safetensors.torch import save_file
 from ..errors import ModelError
 from .config import NetworkConfig
 from .mgca_net import MGCANet
+
+_STAGE_NUMBER = re.compile(r"^(stages|heads)\.(\d+)\.")
 
 
 def save_network(network: MGCANet, path: str | Path, metadata: Mapping[str, str] | None = None) -> None:
@@ -50,6 +54,33 @@ def load_network(path: str | Path) -> MGCANet:
     except (ValueError, RuntimeError, SafetensorError, OSError) as error:
         raise ModelError(f"{path}: weights do not fit the network they name ({error})") from error
     return network.eval().requires_grad_(False)
+
+
+def transfer_weights(source: MGCANet, target: MGCANet) -> None:
+    """Let ``target`` start from the weights of a network of equal width and equally many stages or fewer.
+
+    A stage that the source lacks starts as a copy of its last one. Where a layer sees more inputs than in the source,
+    the further ones count nothing at first; what has no counterpart keeps its random start. Equal networks end up
+    with equal weights.
+
+    Raises:
+        ValueError: the networks differ in more than their stages.
+    """
+    same = replace(source.config, stages=target.config.stages)
+    if same != target.config or source.config.stages > target.config.stages:
+        raise ValueError(f"weights of {source.config} are no start for {target.config}")
+    known = source.state_dict()
+    for name, tensor in target.state_dict().items():
+        old = known.get(_STAGE_NUMBER.sub(lambda match: _last_known(match, source.config.stages), name))
+        if old is None:
+            continue
+        if old.shape != tensor.shape:
+            tensor.zero_()
+        tensor[tuple(slice(size) for size in old.shape)] = old
+
+
+def _last_known(match: re.Match[str], stages: int) -> str:
+    return f"{match[1]}.{min(int(match[2]), stages - 1)}."
 
 
 def count_parameters(network: torch.nn.Module) -> int:

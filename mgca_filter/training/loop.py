@@ -16,7 +16,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
-from ..network import MGCANet, load_network, save_network
+from ..network import MGCANet, load_network, save_network, transfer_weights
 from .checkpoint import restore_checkpoint, save_checkpoint
 from .config import ScheduleConfig, TrainingConfig
 from .datasets import TrainingDataset
@@ -46,7 +46,7 @@ class Trainer:
         validate: figures of a network in per cent, every ``validate_every`` steps and at the end; None = never.
         device: torch device.
         workers: processes that prepare batches; 0 prepares them in this one.
-        initial_weights: weights to start from, of the same network.
+        initial_weights: weights to start from, of a network that has equally many stages or fewer.
     """
 
     def __init__(
@@ -66,7 +66,7 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.network = MGCANet(config.network)
         if initial_weights is not None:
-            self.network.load_state_dict(load_network(initial_weights).state_dict())
+            transfer_weights(load_network(initial_weights), self.network)
         self.network.to(self.device)
         # Started by torchrun, each process holds a share of the batch and gradients are averaged.
         self.model = DistributedDataParallel(self.network) if dist.is_initialized() else self.network

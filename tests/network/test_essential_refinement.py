@@ -13,7 +13,6 @@ from mgca_filter.network.eight_point import weighted_eight_point
 from mgca_filter.network.essential_refinement import refine_essential
 from mgca_filter.pose_refinement import rotation_from_vector
 
-
 WRONG = 40
 
 

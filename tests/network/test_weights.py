@@ -12,7 +12,7 @@ from networks import TINY, tiny_network, two_view_batch
 from safetensors.torch import save_file
 
 from mgca_filter.errors import ModelError
-from mgca_filter.network import load_network, save_network
+from mgca_filter.network import MGCANet, load_network, save_network, transfer_weights
 from mgca_filter.network.weights import count_parameters, read_metadata
 
 
@@ -97,3 +97,33 @@ def test_parameters_are_counted_without_statistics():
     total = sum(tensor.numel() for tensor in network.state_dict().values())
     statistics = sum(buffer.numel() for buffer in network.buffers())
     assert count_parameters(network) == total - statistics > 0
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3])
+def test_equal_networks_end_up_equal(stages):
+    config = dataclasses.replace(TINY, stages=stages)
+    source, target = tiny_network(config), MGCANet(config)
+    transfer_weights(source, target)
+    for mine, given in zip(target.state_dict().values(), source.state_dict().values(), strict=True):
+        assert torch.equal(mine, given)
+
+
+def test_a_further_stage_starts_as_a_copy_and_leaves_the_others_alone():
+    source, target = tiny_network(), MGCANet(dataclasses.replace(TINY, stages=3)).eval()
+    transfer_weights(source, target)
+    batch = two_view_batch(40)
+    with torch.inference_mode():
+        before, after = source(*batch), target(*batch)
+    for head in range(2):
+        torch.testing.assert_close(after.heads[head].logits, before.heads[head].logits)
+    copied = target.stages[2].point_cn3.state_dict()
+    for name, tensor in source.stages[1].point_cn3.state_dict().items():
+        assert torch.equal(copied[name], tensor)
+    wider, narrow = (network.state_dict()["final.consensus.reduce.0.weight"] for network in (target, source))
+    assert torch.equal(wider, narrow)
+
+
+@pytest.mark.parametrize("change", [{"channels": 12}, {"stages": 1}, {"neighbours": 9}])
+def test_weights_of_another_network_are_no_start(change):
+    with pytest.raises(ValueError, match="no start"):
+        transfer_weights(tiny_network(), MGCANet(dataclasses.replace(TINY, **change)))
