@@ -5,6 +5,11 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +24,7 @@ from mgca_filter.network.weights import read_metadata
 from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.training import loop, run_directory, schedule
 from mgca_filter.training.__main__ import main
-from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig
+from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig, load_config
 from mgca_filter.training.datasets import TrainingDataset
 from mgca_filter.training.loop import CHECKPOINT, DivergedError, Trainer
 from mgca_filter.training.run_directory import LOG, VALIDATION
@@ -355,3 +360,114 @@ def test_the_command_trains_and_resumes(tmp_path, capsys):
     (data / "yard.npz").write_bytes(b"torn")
     assert main(command) == 2
     assert "yard.npz" in capsys.readouterr().err
+
+
+def command_line(folder: Path, run: str, steps: int, workers: int = 0) -> list[str]:
+    """Arguments of a short run on two scenes, one of them for tuning, written below ``folder``."""
+    data = folder / "data"
+    if not data.is_dir():
+        data.mkdir()
+        for seed, name in enumerate(("hall", "yard")):
+            write_bundle(data / f"{name}.npz", [make_scene(seed=seed, right=60, wrong=40)])
+    (folder / "run.toml").write_text(CONFIG_TOML.replace("steps = 2\n", f"steps = {steps}\n", 1))
+    arguments = ["--config", str(folder / "run.toml"), "--data", str(data), "--run-dir", str(folder / run)]
+    return [
+        *arguments,
+        "--device",
+        "cpu",
+        "--workers",
+        str(workers),
+        "--validate-every",
+        "1000",
+        "--validate-pairs",
+        "1",
+    ]
+
+
+PROGRAM = """
+import sys
+from mgca_filter.training import loop, run_directory
+from mgca_filter.training.__main__ import main
+loop.LOG_EVERY, loop.SAVE_EVERY = 1, 5
+run_directory.draw_curves = lambda *arguments: None
+if __name__ == "__main__":
+    sys.exit(main())
+"""
+
+
+def program(folder: Path) -> str:
+    """A file that runs the training command with rows and checkpoints every few steps."""
+    (folder / "train.py").write_text(PROGRAM)
+    return str(folder / "train.py")
+
+
+def environment() -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+
+
+def weights_of(run: Path) -> dict[str, torch.Tensor]:
+    """Weights and averaged weights of a run's checkpoint."""
+    state = torch.load(run / CHECKPOINT, weights_only=True)
+    return {f"{part}.{name}": tensor for part in ("network", "average") for name, tensor in state[part].items()}
+
+
+def assert_same_weights(run: Path, other: Path) -> None:
+    one, two = weights_of(run), weights_of(other)
+    assert list(one) == list(two)
+    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
+
+
+def test_a_process_killed_at_any_step_resumes_to_the_same_weights(tmp_path, monkeypatch):
+    monkeypatch.setattr(loop, "LOG_EVERY", 1)
+    command = [sys.executable, program(tmp_path), *command_line(tmp_path, "killed", 24, workers=1)]
+    log = tmp_path / "killed" / LOG
+    last_row = int(np.random.default_rng().integers(1, 18))
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as process:
+        while process.poll() is None and (not log.is_file() or len(log.read_text().splitlines()) <= last_row):
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert len(rows(log)) < 24
+    subprocess.run(command, env=environment(), check=True, capture_output=True)
+    assert main(command_line(tmp_path, "whole", 24)) == 0
+    assert_same_weights(tmp_path / "killed", tmp_path / "whole")
+    assert rows(log) == rows(tmp_path / "whole" / LOG)
+
+
+@pytest.mark.slow
+def test_two_processes_share_a_run_and_resume_it(tmp_path):
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node"]
+
+    def train(processes: int, run: str, *more: str) -> subprocess.CompletedProcess[str]:
+        command = [*launch, str(processes), program(tmp_path), *command_line(tmp_path, run, 6), *more]
+        return subprocess.run(command, env=environment(), capture_output=True, text=True)
+
+    assert train(2, "whole").returncode == 0
+    assert train(2, "cut", "--stop-after", "3").returncode == 0
+    assert train(2, "cut").returncode == 0
+    assert_same_weights(tmp_path / "whole", tmp_path / "cut")
+    assert [row["step"] for row in rows(tmp_path / "whole" / LOG)] == list("123456")  # one process writes
+    start = trainer_start(tmp_path)
+    assert not torch.equal(
+        weights_of(tmp_path / "whole")["network.heads.0.logit.weight"], start["heads.0.logit.weight"]
+    )
+    odd = train(3, "odd")
+    assert odd.returncode != 0
+    assert "sampling.batch_size: 2 pairs do not divide among 3 processes" in odd.stderr
+
+
+def trainer_start(folder: Path) -> dict[str, torch.Tensor]:
+    """Weights that the runs of :func:`command_line` start from."""
+    torch.manual_seed(TrainingConfig("x").seed)
+    return MGCANet(load_config(folder / "run.toml").network).state_dict()
+
+
+def test_known_scenes_are_validated_beside_unknown_ones(tmp_path):
+    write_bundle(tmp_path / "x.npz", [make_scene(seed=0)])
+    arguments = command_line(tmp_path, "run", 2)
+    write_bundle(tmp_path / "data" / "hall.npz", [make_scene(seed=seed, right=60, wrong=40) for seed in range(3)])
+    text = (tmp_path / "run.toml").read_text().replace("[sampling]", "[sampling]\nholdout_every = 3")
+    (tmp_path / "run.toml").write_text(text)
+    assert main([*arguments, "--validate-known", "2"]) == 0
+    (row,) = rows(tmp_path / "run" / VALIDATION)
+    assert {"recall", "known_recall", "fit_AUC@5", "known_fit_AUC@5"} <= set(row)
