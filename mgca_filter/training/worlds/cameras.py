@@ -50,7 +50,7 @@ def draw_camera(rng: np.random.Generator, world: World, first: Camera | None = N
         focal = max(size) * np.exp(rng.normal(np.log(0.95), 0.22))
         centre = rng.normal(0.0, 0.03, 3) * world.distance
     else:
-        focal = first.K[0, 0] * max(size) / max(first.size) * np.exp(rng.normal(0.0, 0.12))
+        focal = first.K[0, 0] * max(size) / max(first.size) * np.exp(rng.normal(0.0, 0.18))
         centre = _moved(rng, world, -first.R.T @ first.t)
     target = world.target + rng.normal(0.0, 0.12, 3) * world.distance
     roll = rng.uniform(-180.0, 180.0) if rng.random() < 0.06 else rng.normal(0.0, 5.0)
@@ -69,10 +69,10 @@ def _draw_size(rng: np.random.Generator) -> tuple[int, int]:
 def _moved(rng: np.random.Generator, world: World, centre: FloatArray) -> FloatArray:
     """The camera's centre turned about the target, and nearer or farther."""
     arm = centre - world.target
-    turn = np.radians(np.clip(np.exp(rng.normal(np.log(18.0), 0.85)), 1.0, 80.0)) * rng.choice([-1.0, 1.0])
+    turn = np.radians(np.clip(np.exp(rng.normal(np.log(24.0), 0.8)), 1.0, 80.0)) * rng.choice([-1.0, 1.0])
     rise = np.radians(rng.normal(0.0, 6.0))
     arm = rotation_matrix(1, turn) @ rotation_matrix(0, rise) @ arm
-    near_to_far = np.exp(rng.normal(0.0, 0.22))
+    near_to_far = np.exp(rng.normal(0.0, 0.28))
     moved: FloatArray = world.target + arm * (min(near_to_far, 1.05) if world.enclosed else near_to_far)
     return moved
 

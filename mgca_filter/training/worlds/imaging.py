@@ -11,7 +11,7 @@ from .visibility import NOTHING, VisibilityMap
 
 PASSER_BY_PROBABILITY = 0.3
 LIGHT_SPREAD = 0.2
-BLUR_PX = (0.45, 1.4)
+BLUR_PX = (0.45, 1.7)
 
 
 def draw_light(rng: np.random.Generator, count: int) -> NDArray[np.float64]:
@@ -48,7 +48,7 @@ def photograph(rng: np.random.Generator, image: NDArray[np.uint8]) -> NDArray[np
     exposed = np.clip(levels[image] * vignette, 0.0, 255.0).astype(np.float32)
     # Never without blur: a lens softens the steps that faces leave at their borders.
     exposed = np.asarray(cv2.GaussianBlur(exposed, (0, 0), rng.uniform(*BLUR_PX)), dtype=np.float32)
-    strength = np.exp(rng.uniform(np.log(0.5), np.log(7.0)))
+    strength = np.exp(rng.uniform(np.log(0.5), np.log(9.0)))
     exposed += rng.standard_normal(exposed.shape, dtype=np.float32) * np.float32(strength)
     taken = np.clip(np.round(exposed), 0, 255).astype(np.uint8)
     quality = int(rng.integers(60, 96))

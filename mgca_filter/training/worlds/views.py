@@ -16,7 +16,7 @@ from .truth import visible_share
 from .visibility import VisibilityMap, see
 from .world import World, draw_world
 
-OVERLAP = (0.1, 0.6)  # a drawn value between them is the least that a view shares with the first
+OVERLAP = (0.06, 0.5)  # a drawn value between them is the least that a view shares with the first
 TRIES = 24
 THUMBNAIL = 1 / 16
 NEAREST_ALLOWED = 0.08  # of the world's distance: nothing may stand right before the lens
