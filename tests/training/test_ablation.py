@@ -22,6 +22,7 @@ name = "tiny"
 tuning_scenes = ["yard"]
 [network]
 channels = 8
+stages = 2
 clusters = 8
 [sampling]
 batch_size = 2
@@ -53,7 +54,11 @@ def test_rows_are_what_their_names_say():
     baseline = network("baseline")
     assert (baseline.stages, baseline.cga, baseline.csmgc, baseline.final_consensus) == (1, False, False, False)
     assert (network("CGA").stages, network("CGA").cga) == (1, True)
-    assert (network("iterations").stages, network("iterations").cga, network("iterations").csmgc) == (2, False, False)
+    assert (network("iterations").stages, network("iterations").cga, network("iterations").csmgc) == (
+        full.stages,
+        False,
+        False,
+    )
     assert (network("iterations + CGA").cga, network("iterations + CGA").csmgc) == (True, False)
     assert (network("iterations + CSMGC").cga, network("iterations + CSMGC").csmgc) == (False, True)
     changed = {row.name: [k for k, v in vars(network(row.name)).items() if v != vars(full)[k]] for row in ROWS[6:]}

@@ -327,6 +327,7 @@ name = "tiny"
 tuning_scenes = ["yard"]
 [network]
 channels = 8
+stages = 2
 clusters = 8
 [sampling]
 batch_size = 2
