@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import multi_view
 import numpy as np
 import onnx
 import pytest
@@ -155,3 +156,23 @@ def match_filter(model_file: Path) -> MatchFilter:
 def scene() -> Scene:
     """120 right and 80 wrong matches of a general scene."""
     return make_scene()
+
+
+@pytest.fixture(scope="session")
+def views() -> list[multi_view.View]:
+    return multi_view.render_views(4)
+
+
+@pytest.fixture(scope="session")
+def raw_matches(views):
+    return multi_view.raw_matches(views)
+
+
+@pytest.fixture
+def image_folder(tmp_path, views) -> Path:
+    """The views as files, and one file that is no image."""
+    folder = tmp_path / "images"
+    folder.mkdir()
+    for view in views:
+        cv2.imwrite(str(folder / view.name), view.image)
+    return folder

@@ -8,7 +8,7 @@ from contextlib import closing
 import multi_view
 import numpy as np
 import pytest
-from integrations.conftest import assert_one_line
+from pipeline_command import assert_one_line
 
 from mgca_filter import cli
 from mgca_filter.epipolar import pose_error_deg, sampson_distance

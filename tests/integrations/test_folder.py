@@ -12,7 +12,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from integrations.conftest import K_WORDS, assert_one_line, start_command
+from pipeline_command import K_WORDS, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.epipolar import pose_error_deg

@@ -8,7 +8,7 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from integrations.conftest import assert_one_line
+from pipeline_command import assert_one_line
 
 from mgca_filter import MatchFilter, cli
 

@@ -6,7 +6,7 @@ import os
 
 import cv2
 import pytest
-from integrations.conftest import K_WORDS
+from pipeline_command import K_WORDS
 
 from mgca_filter import cli
 from mgca_filter.integrations.pair_worker import ImageFeatures, PairWorker

@@ -1,4 +1,4 @@
-"""A rendered scene in four views, and the command as users call it."""
+"""The command as users call it, in a process of its own, and what it says when it fails."""
 
 from __future__ import annotations
 
@@ -7,32 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import cv2
-import multi_view
-import pytest
-
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parent.parent
 K_WORDS = "512,512,319.5,239.5"
-
-
-@pytest.fixture(scope="session")
-def views() -> list[multi_view.View]:
-    return multi_view.render_views(4)
-
-
-@pytest.fixture(scope="session")
-def raw_matches(views):
-    return multi_view.raw_matches(views)
-
-
-@pytest.fixture
-def image_folder(tmp_path, views) -> Path:
-    """The views as files, and one file that is no image."""
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for view in views:
-        cv2.imwrite(str(folder / view.name), view.image)
-    return folder
 
 
 def start_command(*arguments: object, **options) -> subprocess.Popen:
