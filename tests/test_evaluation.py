@@ -381,7 +381,7 @@ def test_a_bar_counts_the_pairs_that_are_run(folder, tmp_path, monkeypatch, caps
 def test_without_tqdm_the_log_counts(folder, monkeypatch, caplog):
     no_warm_up(monkeypatch)
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    with caplog.at_level("INFO"):
+    with caplog.at_level("INFO", logger="mgca_filter"):
         predict([CountingMethod([])], select_pairs(folder), progress=True)
     assert "5/5  counting, yard, seed 0" in caplog.text
 

@@ -334,8 +334,11 @@ inline Ort::Env make_environment() {
 inline Network::Network(const std::filesystem::path& file)
     : environment_(detail::make_environment()), session_(nullptr) {
     try {
-        // The place for execution providers and thread counts.
-        session_ = Ort::Session(environment_, file.c_str(), Ort::SessionOptions());
+        // The place for execution providers and thread counts. The product that this fusion makes rounds by the
+        // number of threads, and a rounding may move logits by tenths; Python leaves it out as well.
+        Ort::SessionOptions options;
+        options.AddConfigEntry("optimization.disable_specified_optimizers", "MatMulScaleFusion");
+        session_ = Ort::Session(environment_, file.c_str(), options);
     } catch (const Ort::Exception& error) {
         throw ModelError(file, std::string("ONNX Runtime cannot open the model (") + error.what() + ")");
     }
