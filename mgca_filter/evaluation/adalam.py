@@ -43,11 +43,11 @@ def locally_affine_matches(pair: ScenePair) -> NDArray[np.bool_]:
     def tensor(values: Any) -> Any:
         return None if values is None else torch.as_tensor(np.asarray(values, dtype=np.float32))
 
-    config = get_adalam_default_config()
+    config: Any = get_adalam_default_config()
     if attributes.size1 is None or attributes.size2 is None:
-        config["scale_rate_threshold"] = None  # type: ignore[typeddict-item]
+        config["scale_rate_threshold"] = None
     if attributes.angle1 is None or attributes.angle2 is None:
-        config["orientation_difference_threshold"] = None  # type: ignore[typeddict-item]
+        config["orientation_difference_threshold"] = None
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
