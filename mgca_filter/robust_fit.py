@@ -106,6 +106,15 @@ class TwoViewModel:
 
 
 @dataclass(frozen=True)
+class _Fit:
+    """The matrix M (3, 3) that one start found, the matches (K, 4) that it saw, and its name."""
+
+    M: Array
+    seen: Array
+    origin: str
+
+
+@dataclass(frozen=True)
 class _Pose:
     """A pose, where it was found and how well it is supported."""
 
@@ -137,30 +146,29 @@ def estimate_model(
     """
     if len(matches.correspondences) < MIN_MATCHES:
         return None
-    found = []
+    fits = []
     for index, start in enumerate(options.runs):
         seen = matches.above(start.margin).correspondences
         M = fit_epipolar(seen, focal_px, options.estimator(index), calibrated)
         if M is not None:
-            found.append((M, index))
+            fits.append(_Fit(M, seen, f"start {index + 1}"))
     if calibrated:
-        return _best_calibrated(matches, found, focal_px, options)
-    return _best_uncalibrated(matches, found, focal_px, options)
+        return _best_calibrated(matches, fits, focal_px, options)
+    return _best_uncalibrated(matches, fits, focal_px, options)
 
 
 def _best_calibrated(
-    matches: RankedMatches, found: Sequence[tuple[Array, int]], focal_px: float, options: RobustFitOptions
+    matches: RankedMatches, fits: Sequence[_Fit], focal_px: float, options: RobustFitOptions
 ) -> TwoViewModel | None:
     """The best-supported pose among the refined starts and the plane's rivals of the best of them."""
     threshold = options.refine_threshold_px / focal_px
     poses = []
-    for M, index in found:
-        start = matches.above(options.runs[index].margin).correspondences
-        pose = pose_from_essential(project_to_essential(M), start[sampson_distance(start, M) < threshold])
+    for fit in fits:
+        pose = pose_from_essential(project_to_essential(fit.M), fit.seen[sampson_distance(fit.seen, fit.M) < threshold])
         if pose is None:
             continue
-        R, t = refine_pose(start, *pose, threshold) if options.refine else pose
-        poses.append(_Pose(R, t, f"start {index + 1}", matches.pose_support(R, t, threshold)))
+        R, t = refine_pose(fit.seen, *pose, threshold) if options.refine else pose
+        poses.append(_Pose(R, t, fit.origin, matches.pose_support(R, t, threshold)))
     if not poses:
         return None
     best = max(poses, key=lambda pose: pose.support)
@@ -172,17 +180,16 @@ def _best_calibrated(
 
 
 def _best_uncalibrated(
-    matches: RankedMatches, found: Sequence[tuple[Array, int]], focal_px: float, options: RobustFitOptions
+    matches: RankedMatches, fits: Sequence[_Fit], focal_px: float, options: RobustFitOptions
 ) -> TwoViewModel | None:
     """The best-supported fundamental matrix, and the pose that the guessed intrinsics make of it."""
-    if not found:
+    if not fits:
         return None
     threshold = options.refine_threshold_px / focal_px
-    M, index = max(found, key=lambda item: matches.support(item[0], threshold))
-    accepted = matches.above(options.runs[index].margin).correspondences
-    E = project_to_essential(M)
-    pose = pose_from_essential(E, accepted[sampson_distance(accepted, M) < threshold])
-    return None if pose is None else TwoViewModel(M, E, *pose, origin=f"start {index + 1}")
+    best = max(fits, key=lambda fit: matches.support(fit.M, threshold))
+    E = project_to_essential(best.M)
+    pose = pose_from_essential(E, best.seen[sampson_distance(best.seen, best.M) < threshold])
+    return None if pose is None else TwoViewModel(best.M, E, *pose, origin=best.origin)
 
 
 def _plane_rivals(matches: RankedMatches, best: _Pose, threshold: float, seed: int) -> list[_Pose]:

@@ -28,14 +28,9 @@ example = _load_example()
 
 
 @dataclass(frozen=True)
-class View:
-    """One image with its features; K in OpenCV's pixels, X_camera = R X_world + t."""
+class View(example.View):
+    """One image with its camera and its features."""
 
-    name: str
-    image: np.ndarray
-    K: np.ndarray
-    R: np.ndarray
-    t: np.ndarray
     keypoints: list[cv2.KeyPoint]
     descriptors: np.ndarray
 

@@ -10,6 +10,7 @@ import torch
 from conftest import make_scene
 from networks import TINY
 from scene_bundles import write_bundle
+from tiny_config import CONFIG_TOML
 
 from mgca_filter.network import NetworkConfig
 from mgca_filter.training import ablation, run_directory
@@ -17,21 +18,6 @@ from mgca_filter.training.ablation_rows import ROWS, Row, row_phases
 from mgca_filter.training.config import ScheduleConfig, SourceConfig, TrainingConfig, load_config
 
 BASE = TrainingConfig(name="x", schedule=ScheduleConfig(steps=7000, warmup_steps=200))
-CONFIG_TOML = """
-name = "tiny"
-tuning_scenes = ["yard"]
-[network]
-channels = 8
-stages = 2
-clusters = 8
-[sampling]
-batch_size = 2
-matches = [32]
-matches_weights = [1.0]
-pool_batches = 1
-[schedule]
-precision = "fp32"
-"""
 
 
 def network(name: str) -> NetworkConfig:

@@ -18,6 +18,7 @@ import torch
 from conftest import make_scene
 from networks import TINY, tiny_network
 from scene_bundles import write_bundle
+from tiny_config import CONFIG_TOML
 
 from mgca_filter.network import MGCANet, load_network, save_network
 from mgca_filter.network.weights import read_metadata
@@ -322,23 +323,7 @@ def test_quick_validation_gives_percentages(bundle):
     assert all(0.0 <= value <= 100.0 for value in figures.values())
 
 
-CONFIG_TOML = """
-name = "tiny"
-tuning_scenes = ["yard"]
-[network]
-channels = 8
-stages = 2
-clusters = 8
-[sampling]
-batch_size = 2
-matches = [32]
-matches_weights = [1.0]
-pool_batches = 1
-[schedule]
-steps = 2
-warmup_steps = 1
-precision = "fp32"
-"""
+TWO_STEPS_TOML = CONFIG_TOML + "steps = 2\nwarmup_steps = 1\n"
 
 
 def test_the_command_trains_and_resumes(tmp_path, capsys):
@@ -346,7 +331,7 @@ def test_the_command_trains_and_resumes(tmp_path, capsys):
     data.mkdir()
     for seed, name in enumerate(("hall", "yard")):
         write_bundle(data / f"{name}.npz", [make_scene(seed=seed, right=60, wrong=40)])
-    (tmp_path / "run.toml").write_text(CONFIG_TOML)
+    (tmp_path / "run.toml").write_text(TWO_STEPS_TOML)
     command = ["--config", str(tmp_path / "run.toml"), "--data", str(data), "--run", str(tmp_path / "run")]
     command += ["--device", "cpu", "--workers", "0", "--validate-pairs", "1"]
     assert main([*command, "--stop-after", "1"]) == 0
@@ -370,7 +355,7 @@ def command_line(folder: Path, run: str, steps: int, workers: int = 0) -> list[s
         data.mkdir()
         for seed, name in enumerate(("hall", "yard")):
             write_bundle(data / f"{name}.npz", [make_scene(seed=seed, right=60, wrong=40)])
-    (folder / "run.toml").write_text(CONFIG_TOML.replace("steps = 2\n", f"steps = {steps}\n", 1))
+    (folder / "run.toml").write_text(TWO_STEPS_TOML.replace("steps = 2\n", f"steps = {steps}\n", 1))
     arguments = ["--config", str(folder / "run.toml"), "--data", str(data), "--run-dir", str(folder / run)]
     return [
         *arguments,
