@@ -44,13 +44,14 @@ class ContextNorm(nn.Module):
         self.register_buffer("running_var", torch.ones(channels))
 
     def forward(self, x: Tensor) -> Tensor:
+        x = x.float()  # a mean over many matches is worth more digits than autocast leaves
         centred = x - x.mean(self.dims, keepdim=True)
         variance = centred.square().mean(self.dims, keepdim=True)
         context_scale = torch.rsqrt(variance + CONTEXT_NORM_EPS)  # (B, 1, C)
         batch_variance = self.running_var
         if self.training:
             batch_variance = (variance * context_scale.square()).flatten(0, -2).mean(0)
-            self.running_var.lerp_(batch_variance.detach().float(), BATCH_NORM_MOMENTUM)
+            self.running_var.lerp_(batch_variance.detach(), BATCH_NORM_MOMENTUM)
         scale = context_scale * (self.weight * torch.rsqrt(batch_variance + BATCH_NORM_EPS))
         return centred * scale + self.bias
 
