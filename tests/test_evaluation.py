@@ -20,7 +20,7 @@ from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.evaluation import predict as predict_module
 from mgca_filter.evaluation.__main__ import main
 from mgca_filter.evaluation.environment import CpuMeter
-from mgca_filter.evaluation.estimators import OpenCvEstimator, PoseLibEstimator, pose_from_essential
+from mgca_filter.evaluation.estimators import OpenCvEstimator, PoseLibEstimator, estimate_from_essential
 from mgca_filter.evaluation.methods import Answer, PairOutcome
 from mgca_filter.evaluation.metrics import precision_recall_f
 from mgca_filter.evaluation.pairs import draw_indices, iterate_pairs, select_pairs
@@ -256,10 +256,10 @@ def test_poselibs_identity_is_no_pose(pair, monkeypatch):
 def test_essential_matrices_in_any_form(scene):
     x1, x2 = ((points - K[:2, 2]) / 800.0 for points in (scene.points1, scene.points2))
     other = essential_from_pose(np.diag([-1.0, -1.0, 1.0]), [0.0, 0.0, 1.0])
-    stacked = pose_from_essential(np.vstack([other, scene.E]), x1, x2, scene.inlier)
+    stacked = estimate_from_essential(np.vstack([other, scene.E]), x1, x2, scene.inlier)
     assert pose_error_deg(stacked.R, stacked.t, scene.R, scene.t) < 1e-4
     for useless in (None, np.zeros((0, 3)), np.full((3, 3), np.nan), np.zeros((2, 3))):
-        assert pose_from_essential(useless, x1, x2, scene.inlier).failure == "no model"
+        assert estimate_from_essential(useless, x1, x2, scene.inlier).failure == "no model"
 
 
 @pytest.mark.parametrize("returned", [(None, None), (np.full((3, 3), np.nan), np.ones((200, 1), np.uint8))])

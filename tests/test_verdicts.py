@@ -44,8 +44,8 @@ def test_features_and_matches_are_computed_once(photos: Path, tmp_path: Path, mo
     def fail(*arguments: object) -> None:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr(photo_pairs, "detect_keypoints", fail)
-    monkeypatch.setattr(photo_pairs, "match_descriptors", fail)
+    monkeypatch.setattr(photo_pairs, "detect", fail)
+    monkeypatch.setattr(photo_pairs, "match_features", fail)
     again = PhotoFolder(photos, tmp_path).pair("p0", "p1")
     np.testing.assert_array_equal(first.kp2, again.kp2)
     np.testing.assert_array_equal(first.attributes.ratio, again.attributes.ratio)

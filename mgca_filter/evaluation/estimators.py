@@ -24,8 +24,8 @@ INFINITE_DEPTH = 1e9
 """``recoverPose`` drops points farther than 50 baselines unless told otherwise."""
 
 
-def pose_from_essential(E: Any, x1: FloatArray, x2: FloatArray, inliers: BoolArray) -> PoseEstimate:
-    """Pose from what ``findEssentialMat`` returned, by ``cv2.recoverPose`` on the inliers.
+def estimate_from_essential(E: Any, x1: FloatArray, x2: FloatArray, inliers: BoolArray) -> PoseEstimate:
+    """A rival's pose from what its estimator returned, by ``cv2.recoverPose`` on the inliers.
 
     Args:
         E: None, (3, 3), or several solutions stacked to (3k, 3), of which the one with most points in front of both
@@ -117,7 +117,7 @@ class OpenCvEstimator:
         )
         if E is None or mask is None:
             return PoseEstimate.failed(len(x1), "no model")
-        return pose_from_essential(E, x1, x2, mask.ravel() > 0)
+        return estimate_from_essential(E, x1, x2, mask.ravel() > 0)
 
 
 @dataclass(frozen=True)
@@ -213,4 +213,4 @@ class DegensacEstimator:
             return PoseEstimate.failed(len(rows), "no model")
         E = project_to_essential(pair.K2.T @ F @ pair.K1)
         x1, x2 = normalize_points(points1, pair.K1), normalize_points(points2, pair.K2)
-        return pose_from_essential(E, x1, x2, np.asarray(mask, dtype=bool).ravel())
+        return estimate_from_essential(E, x1, x2, np.asarray(mask, dtype=bool).ravel())

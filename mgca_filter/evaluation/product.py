@@ -16,7 +16,7 @@ from ..correspondences import MatchAttributes, normalize_points
 from ..result import FilterResult
 from ..scene_bundle import ScenePair
 from .baselines import REVISION
-from .estimators import Estimator, pose_from_essential
+from .estimators import Estimator, estimate_from_essential
 from .methods import MIN_MATCHES, Answer, FloatArray, PoseEstimate
 from .selection import Selection
 
@@ -191,7 +191,7 @@ def pose_without_ransac(E: FloatArray | None, logits: FloatArray, x1: FloatArray
     count = max(int(np.ceil(BEST_SHARE * len(logits))), MIN_MATCHES)
     best = np.zeros(len(logits), dtype=bool)
     best[np.argsort(-logits, kind="stable")[:count]] = True
-    return pose_from_essential(np.asarray(E, dtype=np.float64), x1, x2, best)
+    return estimate_from_essential(np.asarray(E, dtype=np.float64), x1, x2, best)
 
 
 def pose_by_paper_protocol(logits: FloatArray, x1: FloatArray, x2: FloatArray) -> PoseEstimate:
@@ -206,7 +206,7 @@ def pose_by_paper_protocol(logits: FloatArray, x1: FloatArray, x2: FloatArray) -
         return PoseEstimate.failed(len(logits), "no model")
     inliers = np.zeros(len(logits), dtype=bool)
     inliers[rows] = mask.ravel() > 0
-    return pose_from_essential(E, x1, x2, inliers)
+    return estimate_from_essential(E, x1, x2, inliers)
 
 
 @lru_cache(maxsize=1)

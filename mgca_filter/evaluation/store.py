@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-import os
 import re
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from ..atomic_file import replaced_when_done
 from .methods import PairOutcome
 
 logger = logging.getLogger(__name__)
@@ -70,6 +70,5 @@ class ResultStore:
         path = self.folder / key.file_name
         path.parent.mkdir(parents=True, exist_ok=True)
         content = {"key": asdict(key), "outcomes": [asdict(known[pair]) for pair in sorted(known)]}
-        temporary = path.with_suffix(f".{os.getpid()}.tmp")
-        temporary.write_text(json.dumps(content))
-        os.replace(temporary, path)
+        with replaced_when_done(path) as temporary:
+            temporary.write_text(json.dumps(content))

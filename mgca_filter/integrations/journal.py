@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import atomic_file
 from ..errors import MgcaFilterError
 from .pair_worker import PairRow
 
@@ -148,21 +148,16 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replaced_when_done(path: Path) -> Iterator[Path]:
-    """A temporary name beside ``path``, moved there when the block ends well and removed when it does not.
+    """As :func:`mgca_filter.atomic_file.replaced_when_done`, for the user's own output.
 
     Raises:
         PipelineError: writing fails, with an exception of the system or of HDF5.
     """
-    temporary = path.with_name(path.name + ".partial")
     try:
-        yield temporary
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        with atomic_file.replaced_when_done(path) as temporary:
+            yield temporary
     except (OSError, RuntimeError) as error:
         words = getattr(error, "strerror", None) or " ".join(str(error).split())
         raise PipelineError(
             f"{path}: cannot be written ({words}); what is finished is kept, run the command again to go on"
         ) from error
-    finally:
-        temporary.unlink(missing_ok=True)

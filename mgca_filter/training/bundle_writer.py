@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic_file import replaced_when_done
 from .sift import OneWayMatches
 
 ANGLE_UNITS = 256  # of a full turn, to fit a byte
@@ -74,10 +74,8 @@ def write_bundle(path: Path, images: Sequence[BundleImage], pairs: Sequence[Bund
     labels = [pair.labels for pair in pairs if pair.labels is not None]
     if len(labels) == len(pairs):
         fields[LABEL_FIELD] = np.concatenate(labels)
-    temporary = path.with_suffix(".partial")
-    with open(temporary, "wb") as file:
+    with replaced_when_done(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **fields)  # type: ignore[arg-type]
-    os.replace(temporary, path)
 
 
 def _offsets(counts: Sequence[int]) -> NDArray[np.generic]:

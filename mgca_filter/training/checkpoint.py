@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
+from ..atomic_file import replaced_when_done
 from .config import ConfigError, TrainingConfig, config_from_dict
 from .schedule import LossWatch
 
@@ -38,12 +38,8 @@ def save_checkpoint(
         "loss_watch": asdict(watch),
         "torch_rng": torch.get_rng_state(),
     }
-    temporary = path.with_suffix(".partial")
-    with open(temporary, "wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    with replaced_when_done(path) as temporary:
+        torch.save(state, temporary)
 
 
 def restore_checkpoint(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable
 from copy import deepcopy
@@ -16,6 +15,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
 from tqdm import tqdm
 
+from ..atomic_file import replaced_when_done
 from ..network import MGCANet, load_network, save_network, transfer_weights
 from .checkpoint import restore_checkpoint, save_checkpoint
 from .config import ScheduleConfig, TrainingConfig
@@ -119,9 +119,8 @@ class Trainer:
         save_checkpoint(
             self.folder / CHECKPOINT, self.config, self.step, self.network, self.average, self.optimizer, self.watch
         )
-        temporary = self.folder / f"{WEIGHTS}.partial"
-        save_network(self.average, temporary, {"name": self.config.name, "steps": str(self.step)})
-        os.replace(temporary, self.folder / WEIGHTS)
+        with replaced_when_done(self.folder / WEIGHTS) as temporary:
+            save_network(self.average, temporary, {"name": self.config.name, "steps": str(self.step)})
 
     def _log(self, figures: dict[str, float], seconds: float, progress: tqdm[None]) -> None:
         """Write a row, and say how fast the run is and how long it will take."""

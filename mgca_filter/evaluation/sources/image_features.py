@@ -1,4 +1,4 @@
-"""From two images to a pair of the scoreboard: SIFT and nearest neighbours as ``match_images`` takes them."""
+"""From two images to their matches: SIFT and nearest neighbours as ``match_images`` takes them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from ...scene_bundle import ScenePair
 from .base import read_image
 
 FEATURE_SETTINGS = f"sift 2000, revision 1, opencv {cv2.__version__}"
-"""Part of the digest of sources that detect and match themselves."""
+"""Part of the digest of whatever is detected and matched here."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,27 @@ class ImageFeatures:
     diameter: NDArray[np.float32]
     angle: NDArray[np.float32]
     descriptors: NDArray[Any]
+
+    def take(self, rows: NDArray[np.intp]) -> ImageFeatures:
+        """The keypoints of the given rows alone."""
+        points, diameter, angle = self.points[rows], self.diameter[rows], self.angle[rows]
+        return ImageFeatures(self.size, points, diameter, angle, self.descriptors[rows])
+
+
+@dataclass(frozen=True)
+class OneWayMatches:
+    """Nearest neighbour in image 2 of each of M keypoints of image 1, no test applied.
+
+    Attributes:
+        index1, index2: (M,) rows of the two images' features.
+        attributes: what the matcher and the keypoints know of each match.
+        mutual: bool (M,), nearest both ways.
+    """
+
+    index1: NDArray[np.intp]
+    index2: NDArray[np.intp]
+    attributes: MatchAttributes
+    mutual: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -45,9 +66,9 @@ class View:
     K: NDArray[np.float64]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=128)
 def detect(path: Path, quarter_turns: int = 0) -> ImageFeatures:
-    """Features of an image file turned counter-clockwise by ``quarter_turns`` · 90°; kept for the latest 64 images.
+    """Features of an image file turned counter-clockwise by ``quarter_turns`` · 90°; kept for the latest 128 images.
 
     Raises:
         DatasetError: the image is missing or cannot be read.
@@ -64,43 +85,44 @@ def detect(path: Path, quarter_turns: int = 0) -> ImageFeatures:
     )
 
 
+def match_features(one: ImageFeatures, two: ImageFeatures) -> OneWayMatches:
+    """The matches of two images."""
+    forth = read_matches(match_descriptors(one.descriptors, two.descriptors), len(one.points), len(two.points))
+    back = read_matches(match_descriptors(two.descriptors, one.descriptors), len(two.points), len(one.points))
+    attributes = MatchAttributes(
+        ratio=np.full(len(forth), np.nan, dtype=np.float32) if forth.ratio is None else forth.ratio,
+        best=forth.best,
+        size1=one.diameter[forth.index1],
+        size2=two.diameter[forth.index2],
+        angle1=one.angle[forth.index1],
+        angle2=two.angle[forth.index2],
+    )
+    mutual = np.zeros(0, dtype=bool) if len(forth) == 0 else back.index2[forth.index2] == forth.index1
+    return OneWayMatches(forth.index1, forth.index2, attributes, mutual)
+
+
 def match_views(
     scene: str, index: int, view1: View, view2: View, R: NDArray[np.float64], t: NDArray[np.float64]
 ) -> ScenePair:
-    """The pair of two views with pose ``X2 = R X1 + t``: one-way nearest neighbours, no test applied.
+    """The pair of two views with pose ``X2 = R X1 + t``.
 
     Keypoints without undistorted place are left out before matching.
     """
-    rows1, rows2 = (np.flatnonzero(np.isfinite(view.points).all(axis=1)) for view in (view1, view2))
-    descriptors1, descriptors2 = view1.features.descriptors[rows1], view2.features.descriptors[rows2]
-    matches = read_matches(match_descriptors(descriptors1, descriptors2), len(rows1), len(rows2))
-    back = match_descriptors(descriptors2, descriptors1)
-    nearest_in_1 = np.array([row[0].trainIdx for row in back], dtype=np.intp)
-    mutual = np.zeros(len(matches), dtype=bool)
-    if len(matches):
-        mutual = nearest_in_1[matches.index2] == matches.index1
-    index1, index2 = rows1[matches.index1], rows2[matches.index2]
-    attributes = MatchAttributes(
-        ratio=matches.ratio if matches.ratio is not None else np.full(len(index1), np.nan, dtype=np.float32),
-        best=matches.best,
-        size1=view1.features.diameter[index1],
-        size2=view2.features.diameter[index2],
-        angle1=view1.features.angle[index1],
-        angle2=view2.features.angle[index2],
-    )
+    placed1, placed2 = (np.flatnonzero(np.isfinite(view.points).all(axis=1)) for view in (view1, view2))
+    matches = match_features(view1.features.take(placed1), view2.features.take(placed2))
     return ScenePair(
         scene=scene,
         index=index,
         image1=view1.name,
         image2=view2.name,
-        points1=view1.points[index1],
-        points2=view2.points[index2],
+        points1=view1.points[placed1][matches.index1],
+        points2=view2.points[placed2][matches.index2],
         K1=view1.K,
         K2=view2.K,
         image_size1=view1.features.size,
         image_size2=view2.features.size,
         R=R,
         t=t,
-        attributes=attributes,
-        mutual=mutual,
+        attributes=matches.attributes,
+        mutual=matches.mutual,
     )
