@@ -11,8 +11,10 @@ from conftest import SIZE, K, make_scene
 from scene_bundles import bundle_fields, write_bundle
 
 from mgca_filter import MatchFilter
-from mgca_filter.epipolar import rotation_error_deg
+from mgca_filter.epipolar import rotation_error_deg, symmetric_epipolar_distance_squared
+from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation import detectors, focal_error
+from mgca_filter.evaluation.image_sets import photographed, rendered
 from mgca_filter.scene_bundle import SceneBundle
 
 
@@ -59,31 +61,66 @@ def photographs(tmp_path: Path) -> tuple[Path, Path]:
     return tmp_path, write_bundle(tmp_path / "turn.npz", [scene], **changes)
 
 
+@pytest.fixture(scope="module")
+def textures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Pictures for the faces of rendered worlds: blots of every size."""
+    folder = tmp_path_factory.mktemp("textures")
+    for number in range(3):
+        noise = np.random.default_rng(number).normal(size=(3, 240, 320))
+        layers = [cv2.GaussianBlur(one, (0, 0), sigma) for one, sigma in zip(noise, (1.0, 3.0, 9.0))]
+        image = 128 + 35 * sum(layer / layer.std() for layer in layers)
+        cv2.imwrite(str(folder / f"{number}.png"), np.clip(image, 0, 255).astype(np.uint8))
+    return folder
+
+
 @pytest.mark.parametrize("name", detectors.DETECTORS)
 def test_every_detector_finds_the_rotation_at_another_size(
     photographs: tuple[Path, Path], name: str, model_file: Path
 ) -> None:
     folder, path = photographs
-    pair = SceneBundle(path)[0]
-    detector = detectors.make_detector(name)
-    one, two = (detectors.read_features(folder / image, detector) for image in (pair.image1, pair.image2))
-    assert one.size == SIZE
-    intrinsics = detectors._rescaled(pair.K1, pair.image_size1, one.size)
-    np.testing.assert_allclose(intrinsics, K)
-    errors = detectors.errors_of_pair(one, two, detector.defaultNorm(), pair, MatchFilter(model=model_file))
-    assert list(errors) == ["mgca_filter", "ratio 0.8 + RANSAC", "ratio 0.8 + MAGSAC"]
-    knn = detectors.match_descriptors(one.descriptors, two.descriptors, detector.defaultNorm())
-    result = MatchFilter(model=model_file).filter(one.keypoints, two.keypoints, knn, K1=K)
-    assert rotation_error_deg(result.R, pair.R) < 1.0
+    images = photographed(folder, SceneBundle(path))
+    assert list(images.images) == ["000.jpg", "001.jpg"]
+    (pair,) = images.matched(detectors.make_detector(name))
+    assert pair.image_size1 == SIZE
+    np.testing.assert_allclose(pair.K1, K)
+    result = MatchFilter(model=model_file).filter(
+        pair.points1, pair.points2, None, K1=pair.K1, K2=pair.K2, attributes=pair.attributes
+    )
+    assert rotation_error_deg(result.R, SceneBundle(path)[0].R) < 1.0
 
 
-def test_detector_command_counts_the_pairs(
-    photographs: tuple[Path, Path], model_file: Path, capsys: pytest.CaptureFixture[str]
+def test_pairs_without_their_photographs_are_left_out(photographs: tuple[Path, Path]) -> None:
+    folder, path = photographs
+    bundle = write_bundle(folder / "more.npz", [make_scene("rotation"), make_scene()])
+    images = photographed(folder, SceneBundle(bundle))
+    assert [(pair.image1, pair.image2) for pair in images.pairs] == [("000.jpg", "001.jpg")]
+    (folder / "000.jpg").unlink()
+    (folder / "001.jpg").unlink()
+    with pytest.raises(DatasetError, match="none of its"):
+        photographed(folder, SceneBundle(path))
+
+
+def test_rendered_views_know_their_pose(textures: Path, match_filter: MatchFilter) -> None:
+    images = rendered(textures, 1, seed=0)
+    (pair,) = images.matched(detectors.make_detector("sift"))
+    right = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < 1e-4
+    assert np.count_nonzero(right) >= 20
+    (again,) = rendered(textures, 1, seed=0).pairs
+    np.testing.assert_array_equal(again.t, pair.t)
+    assert not np.array_equal(rendered(textures, 1, seed=1).pairs[0].t, pair.t)
+
+
+def test_detector_command_has_a_row_for_every_kind_of_input(
+    photographs: tuple[Path, Path], textures: Path, model_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, path = photographs
-    assert detectors.main([str(folder), str(path), "--detectors", "orb", "--model", str(model_file)]) == 0
-    rows = capsys.readouterr().out.splitlines()[2:]
-    assert [row.split(" | ")[:3] for row in rows] == [
-        ["| orb", method, "1"] for method in ("mgca_filter", "ratio 0.8 + RANSAC", "ratio 0.8 + MAGSAC")
+    arguments = ["--scene", str(folder), str(path), "--rendered", str(textures), "--pairs", "1"]
+    assert detectors.main([*arguments, "--detectors", "orb", "--model", str(model_file)]) == 0
+    rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[:4] for row in rows] == [
+        [f"| {name}", "orb", kind.name, "1"] for name in ("turn", "rendered") for kind in detectors.KINDS
     ]
-    assert detectors.main([str(folder), str(folder / "none.npz")]) == 2
+    assert all(row[-1].rstrip(" |") in kind.rivals for row, kind in zip(rows, 2 * detectors.KINDS))
+    assert detectors.main(["--scene", str(folder), str(folder / "none.npz")]) == 2
+    with pytest.raises(SystemExit, match="2"):
+        detectors.main([])

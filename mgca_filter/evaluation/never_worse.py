@@ -1,0 +1,158 @@
+"""Never worse than the plain estimator? ``python -m mgca_filter.evaluation.never_worse BUNDLES RENDERED.npz``.
+
+*Easy pairs*, of which 30 % of the raw matches and more are right: there a ratio test and PROSAC do well, and the filter
+must not spoil it. *Filtered beforehand*: matches that passed a test that users apply, for the filter and the estimator
+alike. Every difference is paired: both on the same pairs, and on the same draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..epipolar import symmetric_epipolar_distance_squared
+from ..errors import MgcaFilterError
+from ..scene_bundle import ScenePair
+from .methods import Answer, Method
+from .metrics import POSE_STATISTICS, TRUE_INLIER_DISTANCE_SQUARED, FloatArray, pool_pairs
+from .paired_difference import paired_cells
+from .pairs import SceneSelection, iterate_pairs, select_pairs
+from .predict import SceneOutcomes, predict
+from .product import ProductMethod, filter_pair, model_settings
+from .registry import parse_method
+from .selection import Selection
+from .start_study import HEADER, format_starts, study_starts
+from .store import ResultStore
+from .summary import scene_errors
+
+EASY_SHARE = 0.3
+PLAIN = "mutual + ratio 0.9 + PROSAC 0.5 px"
+TESTS = (
+    Selection(max_ratio=0.75),
+    Selection(max_ratio=0.8),
+    Selection(mutual=True),
+    Selection(mutual=True, max_ratio=0.8),
+)
+STATISTIC = POSE_STATISTICS["mAP@5"]
+
+
+@dataclass(frozen=True)
+class ProductWithoutRatio:
+    """The filter on matches that lost their second candidates in a test: sizes and angles are known, ratios are not."""
+
+    selection: Selection
+    model: str | None = None
+
+    seeded = False
+
+    @property
+    def name(self) -> str:
+        return " + ".join([*self.selection.parts, "product without ratio"])
+
+    def settings(self) -> dict[str, Any]:
+        return {"selection": self.selection.settings(), "ratio": "withheld", **model_settings(self.model, {})}
+
+    def run(self, pair: ScenePair, seed: int) -> Answer:
+        kept = self.selection.apply(pair)
+        without = replace(pair, attributes=replace(pair.attributes, ratio=None))
+        result = filter_pair(without, np.flatnonzero(kept), self.model, {})
+        mask = np.zeros(len(kept), dtype=bool)
+        mask[kept] = result.mask
+        return Answer(result.R, result.t, kept, mask, "" if result.t is not None else result.status.value)
+
+
+def right_share(pair: ScenePair) -> float:
+    """Share of the raw matches that lie near the true epipolar line; 0 without matches."""
+    distance = symmetric_epipolar_distance_squared(pair.correspondences, pair.E)
+    return float(np.mean(distance < TRUE_INLIER_DISTANCE_SQUARED)) if len(distance) else 0.0
+
+
+def easy_pairs(selections: Sequence[SceneSelection]) -> list[SceneSelection]:
+    """What is left of the selections when hard pairs are taken out; scenes without an easy pair are not listed."""
+    chosen = [
+        SceneSelection(s.source, tuple(i for i in s.indices if right_share(s.source[i]) >= EASY_SHARE))
+        for s in selections
+    ]
+    return [selection for selection in chosen if len(selection)]
+
+
+def pair_errors(outcomes: SceneOutcomes) -> FloatArray:
+    """Pose errors (S, P) of the pairs of all scenes side by side, each of S runs."""
+    return pool_pairs(scene_errors(outcomes))
+
+
+def easy_table(groups: Mapping[str, Sequence[SceneSelection]], model: str | None, store: ResultStore) -> str:
+    """The filter against PROSAC in ratio order, a line for each group of scenes."""
+    lines = [f"| pairs | number | filter mAP@5 | {PLAIN} mAP@5 | difference |", "|---|---:|---:|---:|---:|"]
+    methods = [parse_method("product", model), parse_method(PLAIN)]
+    for name, selections in groups.items():
+        ours, plain = (pair_errors(outcomes) for outcomes in predict(methods, selections, store=store).values())
+        lines.append(f"| {name} | {ours.shape[1]} | {paired_cells(ours, plain, STATISTIC)} |")
+    return "\n".join(lines)
+
+
+def filtered_table(selections: Sequence[SceneSelection], model: str | None, store: ResultStore) -> str:
+    """The filter on matches that passed a test, by what is known of them, against estimators on the same matches."""
+    lines = [
+        "| matches that passed | the filter knows | estimator | pairs | filter mAP@5 | estimator mAP@5 | difference |",
+        "|---|---|---|---:|---:|---:|---:|",
+    ]
+    for test in TESTS:
+        filters: dict[str, Method] = {
+            "all": ProductMethod("product", test, model),
+            "no ratio": ProductWithoutRatio(test, model),
+            "points": ProductMethod("product bare", test, model),
+        }
+        words = " + ".join(test.parts)
+        rivals = {name: parse_method(f"{words} + {name}") for name in ("PROSAC 0.5 px", "MAGSAC 0.5 px")}
+        results = predict([*filters.values(), *rivals.values()], selections, store=store)
+        errors = {name: pair_errors(outcomes) for name, outcomes in results.items()}
+        for known, method in filters.items():
+            # Whoever holds the ratios can sort by them.
+            for rival in rivals if known == "all" else list(rivals)[1:]:
+                ours = errors[method.name]
+                cells = paired_cells(ours, errors[rivals[rival].name], STATISTIC)
+                lines.append(f"| {words} | {known} | {rival} | {ours.shape[1]} | {cells} |")
+    return "\n".join(lines)
+
+
+def start_table(groups: Mapping[str, Sequence[SceneSelection]], model: str | None) -> str:
+    """Where the answers came from, a line for each group of scenes."""
+    rows = [format_starts(name, study_starts(iterate_pairs(selections), model)) for name, selections in groups.items()]
+    return "\n".join([HEADER, *rows])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 = done, 2 = a file or option that cannot be used."""
+    parser = argparse.ArgumentParser(prog="python -m mgca_filter.evaluation.never_worse", description=__doc__)
+    parser.add_argument("bundles", metavar="BUNDLES", type=Path, help="photographed scenes")
+    parser.add_argument("rendered", metavar="RENDERED.npz", type=Path, help="what mgca_filter.training.render wrote")
+    parser.add_argument("--per-scene", type=int, metavar="N", help="at most N pairs of a scene, filtered beforehand")
+    parser.add_argument("--store", metavar="DIR", help="keep results here, and take from here what is known")
+    parser.add_argument("--model", metavar="FILE")
+    parser.add_argument("--seed", type=int, default=0, help="of the draw of pairs (default 0)")
+    options = parser.parse_args(arguments)
+    try:
+        photographed, rendered = (select_pairs(path) for path in (options.bundles, options.rendered))
+        groups = {"photographs, easy": easy_pairs(photographed), "rendered, easy": easy_pairs(rendered)}
+        groups["rendered, all"] = rendered
+        groups = {name: selections for name, selections in groups.items() if selections}
+        store = ResultStore(options.store)
+        print(easy_table(groups, options.model, store), flush=True)
+        print("\n" + start_table(groups, options.model), flush=True)
+        filtered = select_pairs(options.bundles, None, options.per_scene, options.seed)
+        print("\n" + filtered_table(filtered, options.model, store))
+    except (MgcaFilterError, ValueError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
