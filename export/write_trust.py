@@ -1,16 +1,69 @@
-"""Put what the studies printed into ``docs/trust.md``: ``python export/write_trust.py focal=FILE stress=FILE``.
+"""Run the studies behind ``docs/trust.md`` and put their tables there: ``python export/write_trust.py --store DIR …``.
 
-Each file is the standard output of a command that the page names; a place may be given several files, one a scene say.
+Each study is a command of its own, which the page names; this one gives them the data and the same model. Studies that
+keep answers in the store go on where they stopped, so that an interrupted run is started again as it was.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
+import io
 import re
+import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import cv2
+
+from mgca_filter import model_path
+from mgca_filter.evaluation import detectors, focal_error, never_worse, score_promise, stress, verdicts
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "trust.md"
+Study = Callable[[Sequence[str]], int]
+
+
+def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
+    """By the name of their place in the page: the command and its arguments."""
+    bundles, photos, store = str(options.bundles), str(options.photos), str(options.store)
+    scenes = [word for pair in options.scene for word in ("--scene", *pair)]
+    return {
+        "stress": (stress.main, []),
+        "verdicts": (
+            verdicts.main,
+            [photos, "--same-place", str(options.same_place), "--bundles", bundles, "--store", store],
+        ),
+        "scores": (score_promise.main, [bundles, "--per-scene", "40"]),
+        "never_worse": (
+            never_worse.main,
+            [bundles, str(options.rendered), "--per-scene", "40", "--store", store],
+        ),
+        "focal": (focal_error.main, [bundles, "--per-scene", "20"]),
+        "detectors": (detectors.main, [*scenes, "--rendered", photos]),
+    }
+
+
+def run(study: Study, arguments: Sequence[str]) -> str:
+    """What a study prints.
+
+    Raises:
+        SystemExit: it could not be run; it has said why on standard error.
+    """
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        status = study(arguments)
+    if status == 2:
+        raise SystemExit(status)
+    return output.getvalue().strip()
+
+
+def provenance() -> str:
+    """Which model and library gave the figures."""
+    path = model_path()
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    return f"`{path.name}` {digest[:12]}, OpenCV {cv2.__version__}."
 
 
 def fill(page: str, name: str, content: str) -> str:
@@ -26,21 +79,27 @@ def fill(page: str, name: str, content: str) -> str:
     return filled
 
 
-def main() -> None:
-    """Fill the places that the arguments name."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the studies that were asked for, all by default, and fill their places one by one."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("places", nargs="+", metavar="NAME=FILE", help="place in the page, and what goes there")
-    options = parser.parse_args()
-    contents: dict[str, list[str]] = {}
-    for place in options.places:
-        name, _, file = place.partition("=")
-        path = Path(file)
-        title = f"{path.stem}:\n\n" if sum(p.startswith(f"{name}=") for p in options.places) > 1 else ""
-        contents.setdefault(name, []).append(title + path.read_text(encoding="utf-8").strip())
-    page = PAGE.read_text(encoding="utf-8")
-    for name, texts in contents.items():
-        page = fill(page, name, "\n\n".join(texts))
-    PAGE.write_text(page, encoding="utf-8")
+    parser.add_argument("--bundles", type=Path, required=True, help="scene bundles that training has not seen")
+    parser.add_argument("--rendered", type=Path, required=True, help="bundle of mgca_filter.training.render")
+    parser.add_argument("--photos", type=Path, required=True, help="photographs of different places")
+    parser.add_argument("--same-place", type=Path, required=True, help="those that are not: a line for each place")
+    parser.add_argument(
+        "--scene", nargs=2, action="append", default=[], metavar=("IMAGES", "BUNDLE"), help="photographs of a bundle"
+    )
+    parser.add_argument("--store", type=Path, required=True, help="keeps features, matches and answers")
+    parser.add_argument("--only", nargs="+", metavar="PLACE", help="these places of the page alone")
+    options = parser.parse_args(arguments)
+    known = studies(options)
+    unknown = sorted(set(options.only or ()) - set(known))
+    if unknown:
+        parser.error(f"--only: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+    for name in options.only or known:
+        print(name, file=sys.stderr, flush=True)
+        content = f"{run(*known[name])}\n\n{provenance()}"
+        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), name, content), encoding="utf-8")
 
 
 if __name__ == "__main__":
