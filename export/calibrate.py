@@ -1,23 +1,37 @@
 """Fit the calibration of a model on scene bundles: ``python export/calibrate.py MODEL.onnx BUNDLES SCENE …``.
 
 Fits on the even pairs of the scenes named, checks on the odd ones, and prints what ``export_model.py
---calibration`` takes.
+--calibration`` takes; ``export_model.py --calibrate`` does both at once.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
+from mgca_filter.calibration import Calibration
 from mgca_filter.evaluation.calibration_fit import collect_logits, expected_calibration_error, fit_calibration
 from mgca_filter.evaluation.methods import BoolArray, FloatArray
 from mgca_filter.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.training.validation import select_pairs
 
+PAIRS_PER_SCENE = 24
 
-def gather(model: Path, pairs: list[ScenePair]) -> tuple[FloatArray, BoolArray]:
+
+def calibrate(
+    model: Path, bundles: Path, scenes: Iterable[str], pairs_per_scene: int = PAIRS_PER_SCENE
+) -> tuple[Calibration, float]:
+    """Calibration of a model file on scenes of a folder, and its expected error on as many other pairs of them."""
+    pairs = select_pairs([SceneBundle(bundles / f"{scene}.npz") for scene in scenes], pairs_per_scene)
+    calibration = fit_calibration(*_gather(model, pairs[::2]))
+    logits, truth = _gather(model, pairs[1::2])
+    return calibration, expected_calibration_error(calibration.probabilities(logits).astype(float), truth)
+
+
+def _gather(model: Path, pairs: list[ScenePair]) -> tuple[FloatArray, BoolArray]:
     """Logits and truth of all matches of all pairs."""
     logits, truth = collect_logits(model, pairs)
     return np.concatenate(logits), np.concatenate(truth)
@@ -29,15 +43,11 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("bundles", type=Path, help="folder of scene bundles")
     parser.add_argument("scenes", nargs="+")
-    parser.add_argument("--per-scene", type=int, default=24)
+    parser.add_argument("--per-scene", type=int, default=PAIRS_PER_SCENE)
     options = parser.parse_args()
-    bundles = [SceneBundle(options.bundles / f"{scene}.npz") for scene in options.scenes]
-    pairs = select_pairs(bundles, options.per_scene)
-    calibration = fit_calibration(*gather(options.model, pairs[::2]))
-    logits, truth = gather(options.model, pairs[1::2])
-    error = expected_calibration_error(calibration.probabilities(logits).astype(float), truth)
+    calibration, error = calibrate(options.model, options.bundles, options.scenes, options.per_scene)
     print(f"{calibration.scale:.4f} {calibration.offset:.4f}")
-    print(f"expected calibration error on {len(pairs[1::2])} other pairs: {error:.4f}")
+    print(f"expected calibration error on other pairs of these scenes: {error:.4f}")
 
 
 if __name__ == "__main__":
