@@ -1,0 +1,159 @@
+"""What each step of the robust fit is worth: ``python -m mgca_filter.evaluation.fit_study BUNDLES``.
+
+The network scores every pair once; then the fit runs as users get it, and with one thing changed at a time. Each row
+has its difference to the fit as it is, on the same pairs and the same draws of the bootstrap.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from ..correspondences import candidate_mask, mean_focal_length
+from ..epipolar import pose_error_deg
+from ..errors import MgcaFilterError
+from ..match_filter import MatchFilter
+from ..ranking import RankedMatches, match_order
+from ..robust_fit import SINGLE_START, RobustFitOptions, Start, estimate_pose
+from ..scene_bundle import ScenePair
+from .metrics import FAILURE_DEG, POSE_STATISTICS, FloatArray, mean_over_scenes, paired_bootstrap_interval
+from .pairs import SceneSelection, iterate_pairs, select_pairs
+from .product import filter_pair
+
+STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
+AS_IT_IS = "the fit as it is"
+# From logits (N,), ratios (N,) and whether those are known (N,) to the rows, most promising first.
+Order = Callable[[FloatArray, FloatArray, NDArray[np.bool_]], NDArray[np.intp]]
+
+
+def order_by_logit(logits: FloatArray, ratio: FloatArray, known: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The network's order alone."""
+    return np.argsort(-logits, kind="stable")
+
+
+def order_by_ratio(logits: FloatArray, ratio: FloatArray, known: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """The order of users without a network, on the matches that the network accepts."""
+    return np.argsort(np.where(known, ratio, 1.0), kind="stable")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A fit with one thing changed: fields of :class:`RobustFitOptions`, or the order of the matches."""
+
+    changes: Mapping[str, Any]
+    order: Order = match_order
+
+
+VARIANTS = {
+    AS_IT_IS: Variant({}),
+    "one start, logit > 0": Variant({"starts": SINGLE_START}),
+    "one start, logit > −1": Variant({"starts": (Start(-1.0, 1.0),)}),
+    "the first two starts": Variant({"starts": RobustFitOptions().runs[:2]}),
+    "no refinement, no plane": Variant({"refine": False}),
+    "estimator at 0.35 px": Variant({"threshold_px": 0.35}),
+    "estimator at 0.75 px": Variant({"threshold_px": 0.75}),
+    "refinement cut at 0.75 px": Variant({"refine_threshold_px": 0.75}),
+    "refinement cut at 1.5 px": Variant({"refine_threshold_px": 1.5}),
+    "20 000 iterations": Variant({"max_iterations": 20000, "confidence": 0.99999}),
+    "order by logit": Variant({}, order_by_logit),
+    "order by ratio": Variant({}, order_by_ratio),
+    "MAGSAC": Variant({"method": "magsac"}),
+    "RANSAC": Variant({"method": "ransac"}),
+    "PoseLib": Variant({"method": "poselib"}),
+}
+
+
+@dataclass(frozen=True)
+class ScoredPair:
+    """A pair and what the network says of it: logits (M,), probabilities (M,), the rows (N,) that may be fitted to."""
+
+    pair: ScenePair
+    logits: FloatArray
+    scores: FloatArray
+    rows: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, pair: ScenePair, model: str | None) -> ScoredPair:
+        """One pass of the network."""
+        result = filter_pair(pair, np.arange(len(pair.points1)), model, {"method": "none"})
+        rows = np.flatnonzero(candidate_mask(pair.attributes.encode(len(pair.points1))))
+        return cls(pair, result.info["logits"].astype(np.float64), result.scores.astype(np.float64), rows)
+
+    def error_deg(self, variant: Variant, options: RobustFitOptions) -> float:
+        """Pose error of a fit, 180 without a pose."""
+        attributes = self.pair.attributes.encode(len(self.logits))[self.rows]
+        order = variant.order(self.logits[self.rows], attributes[:, 0].astype(np.float64), attributes[:, 5] > 0)
+        ranked = RankedMatches.of(self.pair.correspondences, self.rows[order], self.scores, self.logits)
+        focal_px = mean_focal_length(self.pair.K1, self.pair.K2)
+        pose = estimate_pose(ranked, focal_px, replace(options, **variant.changes))
+        return FAILURE_DEG if pose is None else pose_error_deg(*pose, self.pair.R, self.pair.t)
+
+
+def study(
+    selections: Sequence[SceneSelection], model: str | None, seeds: Sequence[int]
+) -> tuple[dict[str, dict[str, FloatArray]], dict[str, float]]:
+    """By variant: pose errors (S, P) of each scene, and the median processor time of a fit in milliseconds."""
+    cv2.setNumThreads(1)
+    options = MatchFilter(model=model).fit_options
+    errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in VARIANTS}
+    times: dict[str, list[float]] = {name: [] for name in VARIANTS}
+    total = sum(map(len, selections))
+    for pair in tqdm(iterate_pairs(selections), total=total, unit="pair", disable=None):
+        scored = ScoredPair.of(pair, model)
+        for name, variant in VARIANTS.items():
+            started = time.process_time()
+            row = [scored.error_deg(variant, replace(options, seed=seed)) for seed in seeds]
+            times[name].append(1e3 * (time.process_time() - started) / len(seeds))
+            errors[name].setdefault(pair.scene, []).append(row)
+    pose_errors = {name: {scene: np.array(rows).T for scene, rows in scenes.items()} for name, scenes in errors.items()}
+    return pose_errors, {name: float(np.median(values)) for name, values in times.items()}
+
+
+def format_study(errors: Mapping[str, Mapping[str, FloatArray]], times: Mapping[str, float]) -> str:
+    """Markdown: a row for each variant, per cent, with 95 % paired bootstrap intervals of the differences."""
+    lines = [
+        "| | " + " | ".join(STATISTICS) + " | difference in mAP@20 | difference in AUC@5 | ms of the fit |",
+        "|---|" + "---:|" * (len(STATISTICS) + 3),
+    ]
+    for name, scenes in errors.items():
+        cells = [f"{100 * mean_over_scenes(POSE_STATISTICS[key], scenes):.1f}" for key in STATISTICS]
+        for key in STATISTICS[1:]:
+            statistic = POSE_STATISTICS[key]
+            means = [100 * mean_over_scenes(statistic, one) for one in (scenes, errors[AS_IT_IS])]
+            low, high = (100 * x for x in paired_bootstrap_interval(scenes, errors[AS_IT_IS], statistic))
+            cells.append("" if name == AS_IT_IS else f"{means[0] - means[1]:+.1f} [{low:+.1f}, {high:+.1f}]")
+        lines.append(f"| {name} | " + " | ".join(cells) + f" | {times[name]:.1f} |")
+    return "\n".join(lines)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 = done, 2 = a file or option that cannot be used."""
+    parser = argparse.ArgumentParser(prog="python -m mgca_filter.evaluation.fit_study", description=__doc__)
+    parser.add_argument("bundles", metavar="BUNDLES", nargs="+", help="scene bundles, or folders of them")
+    parser.add_argument("--per-scene", type=int, metavar="N", help="at most N pairs of a scene")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="of the estimators (default 0)")
+    parser.add_argument("--model", metavar="FILE")
+    options = parser.parse_args(arguments)
+    try:
+        selections = select_pairs(options.bundles, None, options.per_scene)
+        errors, times = study(selections, options.model, options.seeds)
+    except (MgcaFilterError, ValueError, ImportError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    count = sum(map(len, selections))
+    print(f"{count} pairs, {len(selections)} scenes, seeds {', '.join(map(str, options.seeds))}; means over scenes.\n")
+    print(format_study(errors, times))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
