@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 DETECTOR_MAX_SIDE_PX = 1200
 SIFT_FEATURE_COUNT = 2000
 SIFT_CONTRAST_THRESHOLD = 1e-5
+# In a narrower strip OpenCV's detectors find nothing, and some of them fail.
+_NARROWEST_PX = 6
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,8 @@ def detect_keypoints(
         an empty (0, 0) array when nothing is found.
 
     Raises:
-        TypeError: ``image`` is not a uint8 array. ValueError: its shape is not that of an image.
+        TypeError: ``image`` is not a uint8 array, or ``detector`` does not describe. ValueError: ``image`` has not the
+            shape of an image.
     """
     grey = _grey(image, name)
     scale = min(1.0, max_side_px / max(grey.shape))
@@ -130,9 +133,17 @@ def detect_keypoints(
         small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
     else:
         small = grey
-    keypoints, descriptors = detector.detectAndCompute(small, None)
+    nothing: tuple[list[cv2.KeyPoint], NDArray[Any]] = [], np.zeros((0, 0), dtype=np.float32)
+    if min(small.shape) < _NARROWEST_PX:
+        return nothing
+    try:
+        keypoints, descriptors = detector.detectAndCompute(small, None)
+    except cv2.error as error:
+        if error.code != cv2.Error.StsNotImplemented:
+            raise
+        raise TypeError(f"detector: expected one that describes, got {type(detector).__name__}") from error
     if descriptors is None or len(keypoints) == 0:
-        return [], np.zeros((0, 0), dtype=np.float32)
+        return nothing
     scale_x, scale_y = small.shape[1] / grey.shape[1], small.shape[0] / grey.shape[0]
     return [_rescaled(k, scale_x, scale_y) for k in keypoints], descriptors
 

@@ -110,3 +110,16 @@ def test_unknown_detector_and_count_are_refused() -> None:
         create_detector("surf")
     with pytest.raises(ValueError, match="feature_count"):
         create_detector("sift", 0)
+
+
+@pytest.mark.parametrize("name", ["sift", "orb", "akaze"])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 500), (500, 2), (1, 3000), (6, 6), (7, 2500)])
+def test_images_of_a_few_pixels_are_data(name: str, shape: tuple[int, int]) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+    keypoints, descriptors = detect_keypoints(noise, create_detector(name))
+    assert len(keypoints) == len(descriptors)
+
+
+def test_a_detector_that_does_not_describe_is_refused(photograph: np.ndarray) -> None:
+    with pytest.raises(TypeError, match="detector: expected one that describes, got FastFeatureDetector"):
+        detect_keypoints(photograph[:200, :200], cv2.FastFeatureDetector.create())

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..calibration import sigmoid
 from ..correspondences import candidate_mask, mean_focal_length
 from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..evaluation.metrics import (
@@ -110,9 +111,8 @@ def evaluate_pair(network: MGCANet, pair: ScenePair, given: InputList | None = N
         logits = network.prior(known).double().cpu().numpy()
     entered = output.logits[0].double().cpu().numpy()
     logits[rows] = entered
-    scores = 1.0 / (1.0 + np.exp(-np.clip(entered, -60.0, 60.0)))
-    order = match_order(scores, encoded[rows, 0], encoded[rows, 5] > 0)
-    fit = estimate_pose(RankedMatches.of(x, order, scores, entered), mean_focal_length(pair.K1, pair.K2))
+    order = match_order(entered, encoded[rows, 0], encoded[rows, 5] > 0)
+    fit = estimate_pose(RankedMatches.of(x, order, sigmoid(entered), entered), mean_focal_length(pair.K1, pair.K2))
     best = np.argsort(-entered)[: max(len(entered) // 10, 8)]
     own = pose_from_essential(output.essential[0].double().cpu().numpy(), x[best])
     return PairFigures(logits, truth, _error(fit, pair), _error(own, pair))
