@@ -89,21 +89,28 @@ def _is_knn_row(row: Any) -> bool:
 
 def _from_dmatch(source: Any, rows: Sequence[Any], count1: int, count2: int, name: str) -> PutativeMatches:
     """Matches from rows of candidates, best first; a row may be empty."""
-    count = len(rows)
-    index1, index2 = np.full(count, -1, dtype=np.intp), np.full(count, -1, dtype=np.intp)
-    distance1, distance2 = np.full(count, np.nan), np.full(count, np.nan)
-    for i, row in enumerate(rows):
-        if not isinstance(row, Sequence) or not all(isinstance(m, cv2.DMatch) for m in row):
-            raise TypeError(f"{name}[{i}]: expected cv2.DMatch like its neighbours, got {_describe(row)}")
-        if len(row) > 0:
-            index1[i], index2[i], distance1[i] = row[0].queryIdx, row[0].trainIdx, row[0].distance
-        if len(row) > 1:
-            distance2[i] = row[1].distance
+    # Types first, each only once: asking every match for its own takes longer than reading it.
+    if not all(issubclass(kind, Sequence) for kind in set(map(type, rows))) or not all(
+        issubclass(kind, cv2.DMatch) for kind in {type(match) for row in rows for match in row}
+    ):
+        i, row = next((i, row) for i, row in enumerate(rows) if not _holds_matches(row))
+        raise TypeError(f"{name}[{i}]: expected cv2.DMatch like its neighbours, got {_describe(row)}")
     present = np.array([len(row) > 0 for row in rows])
+    contested = np.array([len(row) > 1 for row in rows])
+    index1, index2 = np.full(len(rows), -1, dtype=np.intp), np.full(len(rows), -1, dtype=np.intp)
+    distance1, distance2 = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    index1[present] = [row[0].queryIdx for row in rows if len(row) > 0]
+    index2[present] = [row[0].trainIdx for row in rows if len(row) > 0]
+    distance1[present] = [row[0].distance for row in rows if len(row) > 0]
+    distance2[contested] = [row[1].distance for row in rows if len(row) > 1]
     _check_range(index1[present], index2[present], count1, count2, name)
     distance1, distance2 = (np.where(np.abs(d) < _NO_DISTANCE, d, np.nan) for d in (distance1, distance2))
     ratio = None if np.isnan(distance2).all() else distance_ratio(distance1, distance2)
     return PutativeMatches(index1, index2, ratio, best_of_list(index2, distance1), source)
+
+
+def _holds_matches(row: Any) -> bool:
+    return isinstance(row, Sequence) and all(isinstance(match, cv2.DMatch) for match in row)
 
 
 def _describe(row: Any) -> str:
