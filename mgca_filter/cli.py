@@ -4,78 +4,54 @@ from __future__ import annotations
 
 import argparse
 import logging
-import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from . import __version__
+from .cli_arguments import (
+    EXIT_FOUND,
+    EXIT_NO_GEOMETRY,
+    EXIT_USAGE,
+    OneLineParser,
+    UsageError,
+    intrinsics,
+    one_line,
+    positive,
+)
 from .cli_output import MatchReport, picture, summary, to_json, write_npz
 from .comparison import BaselineFit, comparison_table, fit_baselines
 from .errors import MgcaFilterError
-from .image_header import MAX_PIXELS, promised_size
+from .estimators import METHODS
+from .image_file import decode_image
 from .image_matching import match_images
+from .keypoints import DETECTORS
 
-EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
 SUBCOMMANDS = ("colmap", "hloc", "folder")
 _EPILOG = """\
+For many images: mgca-match colmap | hloc | folder --help.
+
 exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
 1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""
 
 _log = logging.getLogger("mgca_filter")
 
 
-class UsageError(Exception):
-    """One line for the user; the command exits with 2."""
-
-
-class _OneLineParser(argparse.ArgumentParser):
-    """argparse without the usage block in front of each error."""
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(f"{message} (see {self.prog} --help)")
-
-
-def _intrinsics(text: str) -> NDArray[np.float64]:
-    """K (3, 3) from ``fx,fy,cx,cy``."""
-    try:
-        fx, fy, cx, cy = (float(word) for word in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected fx,fy,cx,cy in pixels, got {text!r}") from None
-    if not all(math.isfinite(value) for value in (fx, fy, cx, cy)) or fx <= 0 or fy <= 0:
-        raise argparse.ArgumentTypeError(f"expected finite numbers and positive focal lengths, got {text!r}")
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-
-
-def _positive(kind: type[int] | type[float]) -> Any:
-    def parse(text: str) -> float:
-        try:
-            value = kind(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"expected a number, got {text!r}") from None
-        if not math.isfinite(value) or value <= 0:
-            raise argparse.ArgumentTypeError(f"expected a positive number, got {text!r}")
-        return value
-
-    return parse
-
-
 def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
-    parser = _OneLineParser(
+    parser = OneLineParser(
         prog="mgca-match",
         description="Match two images and keep the matches that agree with one camera motion.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("image1", metavar="img1", type=Path)
-    parser.add_argument("image2", metavar="img2", type=Path)
+    parser.add_argument("image1", metavar="img1", type=Path, help="image file; the pose is that of img2's camera")
+    parser.add_argument("image2", metavar="img2", type=Path, help="relative to img1's: X2 = R X1 + t")
     out = parser.add_argument_group("output")
     out.add_argument("-o", "--output", metavar="OUT.png", type=Path, help="picture of kept and rejected matches")
     out.add_argument("--json", metavar="FILE", help='pose, status and kept matches; "-" = alone on stdout')
@@ -84,25 +60,25 @@ def build_parser() -> argparse.ArgumentParser:
     out.add_argument("-q", "--quiet", action="store_true", help="no summary, errors only")
     out.add_argument("-v", "--verbose", action="store_true", help="log what is done, on stderr")
     camera = parser.add_argument_group("cameras", "fx,fy,cx,cy in pixels; without them the focal length is guessed")
-    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=_intrinsics, help="intrinsics of both images")
-    camera.add_argument("--K1", metavar="fx,fy,cx,cy", type=_intrinsics, help="of the first image, with --K2")
-    camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=_intrinsics, help="of the second image, with --K1")
+    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of both images")
+    camera.add_argument("--K1", metavar="fx,fy,cx,cy", type=intrinsics, help="of the first image, with --K2")
+    camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=intrinsics, help="of the second image, with --K1")
     matching = parser.add_argument_group("matching")
-    matching.add_argument("--detector", choices=("sift", "orb", "akaze"), default="sift")
-    matching.add_argument("--max-keypoints", metavar="N", type=_positive(int), default=2000, help="default 2000")
-    matching.add_argument("--threshold", metavar="PX", type=_positive(float), default=1.0, help="pixels, default 1.0")
+    matching.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
+    matching.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
+    matching.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
     matching.add_argument(
         "--keep-precision",
         metavar="P",
-        type=_positive(float),
+        type=positive(float),
         help="instead of a threshold: expected share of right ones",
     )
     matching.add_argument(
-        "--method", choices=("prosac", "magsac", "ransac", "poselib", "none"), default="prosac", help="robust fit"
+        "--method", choices=METHODS, default="prosac", help="robust fit, default prosac; none = scores alone"
     )
     matching.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
     matching.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
-    matching.add_argument("--seed", type=int, default=0)
+    matching.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
     parser.add_argument("--version", action="version", version=f"mgca-match {__version__}")
     return parser
 
@@ -114,22 +90,11 @@ def read_image(path: Path) -> NDArray[np.uint8]:
         UsageError: the file cannot be read or decoded; the message names it.
     """
     try:
-        data = path.read_bytes()
+        return decode_image(path.read_bytes())
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from error
-    if not data:
-        raise UsageError(f"{path}: the file is empty")
-    width, height = promised_size(data) or (0, 0)
-    if width * height > MAX_PIXELS:
-        raise UsageError(f"{path}: its header promises {width} x {height} pixels, at most {MAX_PIXELS} are read")
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except (cv2.error, MemoryError) as error:
-        # OpenCV refuses more than 2^30 pixels unless OPENCV_IO_MAX_IMAGE_PIXELS says otherwise.
-        raise UsageError(f"{path}: OpenCV cannot decode it; it is broken or too large") from error
-    if image is None:
-        raise UsageError(f"{path}: not an image that OpenCV can decode")
-    return np.asarray(image, dtype=np.uint8)
+    except ValueError as error:
+        raise UsageError(f"{path}: {error}") from error
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -138,7 +103,9 @@ def _check_outputs(options: argparse.Namespace) -> None:
     for path in (options.output, json_path, options.npz):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
-    if options.output is not None and not cv2.haveImageWriter(str(options.output)):
+        if path is not None and path.resolve() in (options.image1.resolve(), options.image2.resolve()):
+            raise UsageError(f"{path}: is one of the images")
+    if options.output is not None and not (options.output.suffix and cv2.haveImageWriter(str(options.output))):
         raise UsageError(f"{options.output}: OpenCV cannot write pictures of this type, use .png or .jpg")
 
 
@@ -227,11 +194,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)
         report = _match(options)
         _write(report, options)
-    except OSError as error:  # of an output file; the inputs have their own message
-        print(f"mgca-match: {error.filename}: {error.strerror}", file=sys.stderr)
-        return EXIT_USAGE
-    except (UsageError, MgcaFilterError, ImportError, ValueError, TypeError) as error:
-        print(f"mgca-match: {' '.join(str(error).split())}", file=sys.stderr)
+    except (UsageError, MgcaFilterError, ImportError, OSError, ValueError, TypeError) as error:
+        print(f"mgca-match: {one_line(error)}", file=sys.stderr)
         return EXIT_USAGE
     return EXIT_FOUND if report.found_geometry else EXIT_NO_GEOMETRY
 

@@ -114,7 +114,7 @@ def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibr
     try:
         import poselib
     except ImportError as error:
-        raise ImportError("method='poselib' needs PoseLib: pip install 'mgca-filter[poselib]'") from error
+        raise ImportError("method='poselib' needs PoseLib: pip install 'mgca_filter[poselib]'") from error
     ransac = {
         "max_epipolar_error": options.threshold_px,
         "progressive_sampling": True,

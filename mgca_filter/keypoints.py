@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+DETECTORS = ("sift", "orb", "akaze")
 DETECTOR_MAX_SIDE_PX = 1200
 SIFT_FEATURE_COUNT = 2000
 SIFT_CONTRAST_THRESHOLD = 1e-5
@@ -104,7 +105,7 @@ def create_detector(name: str = "sift", feature_count: int = SIFT_FEATURE_COUNT)
         # OpenCV 5 moved AKAZE to the contrib module.
         akaze: type[cv2.xfeatures2d.AKAZE] = getattr(cv2, "AKAZE", None) or cv2.xfeatures2d.AKAZE
         return akaze.create(max_points=feature_count)
-    raise ValueError(f"detector: expected 'sift', 'orb', 'akaze' or a cv2.Feature2D, got {name!r}")
+    raise ValueError(f"detector: expected {', '.join(DETECTORS)} or a cv2.Feature2D, got {name!r}")
 
 
 def detect_keypoints(

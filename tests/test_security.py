@@ -17,6 +17,7 @@ from mgca_filter.backends import open_backend
 from mgca_filter.backends.checksums import SUMS_NAME, check_checksum, read_checksums, record_checksums
 from mgca_filter.evaluation.hostile_files import png_that_promises
 from mgca_filter.image_header import MAX_PIXELS, promised_size
+from mgca_filter.integrations.pair_worker import PairWorker
 
 PACKAGE = Path(mgca_filter.__file__).parent
 # Calls that run what a file says: pickles in any wrapping, and code.
@@ -109,3 +110,4 @@ def test_an_image_that_promises_too_much_is_not_decoded(
     assert error.count("\n") == 1
     assert "bomb.png" in error
     assert "20000 x 20000" in error
+    assert PairWorker({}).extract("bomb.png", path.read_bytes(), "sift", 10) == ("bomb.png", None)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .engines import Engine
 from .journal import Journal, PipelineError, replaced_when_done, sqlite_errors
-from .pair_job import Summary, run_pairs, work_folder
+from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
 HALF_PIXEL = 0.5
@@ -72,7 +72,7 @@ class ColmapJob:
             copy_database(self.database, copy)
             with closing(open_database(copy, self.database)) as database:
                 content = {"content": content_digest(copy), "descriptors": self.use_descriptors}
-                journal.begin({**content, **filter_options})
+                journal.begin({**content, **run_identity(filter_options)})
                 summary = run_pairs(DatabaseSource(database, self.use_descriptors), engine, journal, quiet)
                 write_geometries(database, journal.rows())
             self._deliver(copy)

@@ -5,22 +5,36 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ..cli import EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE, UsageError, _intrinsics, _OneLineParser, _positive
+from ..cli_arguments import (
+    EXIT_FOUND,
+    EXIT_NO_GEOMETRY,
+    EXIT_USAGE,
+    OneLineParser,
+    UsageError,
+    intrinsics,
+    one_line,
+    positive,
+)
 from ..errors import MgcaFilterError
+from ..estimators import METHODS
+from ..keypoints import DETECTORS
 from .pair_job import EngineOptions, Summary
 
 _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
 written. A killed run goes on where it stopped when the same command is given again."""
+# The extra that brings a package.
+_EXTRAS = {"pycolmap": "colmap", "h5py": "hloc", "tqdm": "folder", "ray": "ray"}
 
 
 def build_parser() -> argparse.ArgumentParser:
     """The subcommands' arguments."""
-    parser = _OneLineParser(prog="mgca-match", epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(dest="command", required=True, parser_class=_OneLineParser)
+    parser = OneLineParser(prog="mgca-match", epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser)
     for add in (_add_colmap, _add_hloc, _add_folder):
         command = add(commands)
         command.epilog, command.formatter_class = _EPILOG, argparse.RawDescriptionHelpFormatter
@@ -66,10 +80,10 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
     command.add_argument(
         "--pairs", metavar="FILE|exhaustive|sequential", default="exhaustive", help="which to match, default exhaustive"
     )
-    command.add_argument("--overlap", metavar="N", type=_positive(int), default=10, help="sequential: N next images")
-    command.add_argument("--K", metavar="fx,fy,cx,cy", type=_intrinsics, help="intrinsics of all images, pixels")
-    command.add_argument("--detector", choices=("sift", "orb", "akaze"), default="sift")
-    command.add_argument("--max-keypoints", metavar="N", type=_positive(int), default=2000, help="default 2000")
+    command.add_argument("--overlap", metavar="N", type=positive(int), default=10, help="sequential: N next images")
+    command.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of all images, pixels")
+    command.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
+    command.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
     command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
     command.set_defaults(run=_run_folder)
     return command
@@ -77,13 +91,14 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
 
 def _add_common(command: argparse.ArgumentParser) -> None:
     group = command.add_argument_group("filter")
-    group.add_argument("--threshold", metavar="PX", type=_positive(float), default=1.0, help="pixels, default 1.0")
-    group.add_argument("--method", choices=("prosac", "magsac", "ransac", "poselib"), default="prosac")
+    group.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
+    fits = [method for method in METHODS if method != "none"]
+    group.add_argument("--method", choices=fits, default="prosac", help="robust fit, default prosac")
     group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
-    group.add_argument("--seed", type=int, default=0)
+    group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
     workers = command.add_argument_group("workers")
-    workers.add_argument("-j", "--jobs", metavar="N", type=_positive(int), default=1, help="workers, default 1")
-    workers.add_argument("--engine", choices=("local", "ray"), default="local")
+    workers.add_argument("-j", "--jobs", metavar="N", type=positive(int), default=1, help="workers, default 1")
+    workers.add_argument("--engine", choices=("local", "ray"), default="local", help="processes here (default), or Ray")
     workers.add_argument("--address", metavar="HOST", help='of a Ray cluster ("auto" = this machine\'s)')
     command.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary, errors only")
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
@@ -139,6 +154,7 @@ def _run_folder(options: argparse.Namespace) -> Summary:
     if options.output.suffix not in OUTPUTS:
         raise UsageError(f"{options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
     _check_output(options, options.output, [])
+    import_module(OUTPUTS[options.output.suffix])  # better missed now than when all pairs are done
     names = list_images(options.images)
     if options.pairs == "exhaustive":
         pairs = exhaustive_pairs(names)
@@ -182,14 +198,13 @@ def main(arguments: Sequence[str]) -> int:
         options = build_parser().parse_args(arguments)
         summary = options.run(options)
     except ImportError as error:
-        print(f"mgca-match: {error}; pip install 'mgca_filter[{arguments[0]}]' brings it", file=sys.stderr)
+        extra = _EXTRAS.get(error.name or "")
+        hint = f"; pip install 'mgca_filter[{extra}]' brings it" if extra else ""
+        print(f"mgca-match: {one_line(error)}{hint}", file=sys.stderr)
         return EXIT_USAGE
-    except OSError as error:
-        words = f"{error.filename}: {error.strerror}" if error.filename else " ".join(str(error).split())
-        print(f"mgca-match: {words}", file=sys.stderr)
-        return EXIT_USAGE
-    except (UsageError, MgcaFilterError, ValueError, TypeError, RuntimeError) as error:  # the last: pycolmap, HDF5
-        print(f"mgca-match: {' '.join(str(error).split())}", file=sys.stderr)
+    except (UsageError, MgcaFilterError, OSError, ValueError, TypeError, RuntimeError) as error:
+        # RuntimeError: of pycolmap and HDF5
+        print(f"mgca-match: {one_line(error)}", file=sys.stderr)
         return EXIT_USAGE
     except KeyboardInterrupt:
         print("mgca-match: interrupted; the same command goes on where it stopped", file=sys.stderr)

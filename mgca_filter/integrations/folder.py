@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from .engines import Engine
 from .feature_cache import FeatureCache
 from .journal import Journal, replaced_when_done
-from .pair_job import Summary, run_pairs, work_folder
+from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
-OUTPUTS = (".db", ".h5", ".jsonl")
+# Kinds of output, and the module that writing one needs.
+OUTPUTS = {".db": "pycolmap", ".h5": "h5py", ".jsonl": "json"}
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,8 @@ class FolderJob:
         features = {"detector": self.detector, "max_keypoints": self.max_keypoints}
         camera = {"K": None if self.K is None else self.K.tolist()}
         try:
-            journal.begin({"images": str(self.images.resolve()), **features, **camera, **filter_options})
+            folder = {"images": str(self.images.resolve())}
+            journal.begin({**folder, **features, **camera, **run_identity(filter_options)})
             cache = FeatureCache(self.cache or work / "features", self.images, self.detector, self.max_keypoints)
             names = sorted({name for pair in self.pairs for name in pair})
             cache.fill(names, engine, quiet)

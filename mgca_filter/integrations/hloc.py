@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from .engines import Engine
 from .journal import Journal, PipelineError, file_stamp, replaced_when_done
-from .pair_job import Summary, run_pairs, work_folder
+from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
 _SIFT_LENGTH = 128
@@ -54,7 +54,7 @@ class HlocJob:
             inputs = {str(path.resolve()): file_stamp(path) for path in (self.features, self.matches)}
             journal = Journal(work / "journal.db")
             try:
-                journal.begin({"inputs": inputs, "descriptors": self.use_descriptors, **filter_options})
+                journal.begin({"inputs": inputs, "descriptors": self.use_descriptors, **run_identity(filter_options)})
                 summary = run_pairs(source, engine, journal, quiet)
                 with replaced_when_done(self.output) as partial:
                     shutil.copyfile(self.matches, partial)

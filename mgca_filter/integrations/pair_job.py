@@ -12,7 +12,10 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
-from .engines import Engine, ProcessEngine, SerialEngine
+from .. import __version__
+from ..backends.checksums import sha256_of
+from ..match_filter import MatchFilter, model_path
+from .engines import Engine, ProcessEngine, SerialEngine, use_one_thread
 from .journal import Journal
 from .pair_worker import EXPLAINED, ImageFeatures
 
@@ -43,7 +46,9 @@ class EngineOptions:
     address: str | None = None
 
     def open(self, filter_options: dict[str, Any]) -> Engine:
-        """Start the workers."""
+        """Start the workers; errors as of :class:`mgca_filter.MatchFilter`."""
+        use_one_thread()
+        MatchFilter(**filter_options)  # what a worker says when it cannot start does not reach the user
         if self.kind == "ray":
             from .ray_engine import RayEngine
 
@@ -74,6 +79,15 @@ class Summary:
         rate = f", {self.pairs_now / self.seconds:.1f} pairs/s" if self.pairs_now and self.seconds > 0 else ""
         resumed = f" ({pairs - self.pairs_now} were done before)" if pairs > self.pairs_now else ""
         return "\n".join([*lines, f"{self.pairs_now} pairs in {self.seconds:.1f} s{rate}{resumed}"])
+
+
+def run_identity(filter_options: dict[str, Any]) -> dict[str, Any]:
+    """What a resumed run must have in common with the killed one besides its input, as JSON values.
+
+    The options of the filter, the content of its model and the version of this package: each of them changes rows.
+    """
+    model = Path(filter_options.get("model") or model_path())
+    return {**filter_options, "model_sha256": sha256_of(model), "version": __version__}
 
 
 def run_pairs(source: PairSource, engine: Engine, journal: Journal, quiet: bool = False) -> Summary:

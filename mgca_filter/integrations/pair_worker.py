@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correspondences import MatchAttributes
+from ..image_file import decode_image
 from ..keypoints import create_detector, detect_keypoints
 from ..match_filter import MatchFilter
 from ..matching import best_of_list, distance_ratio, match_descriptors
@@ -137,14 +138,11 @@ class PairWorker:
 
         None in place of the features of a file that cannot be decoded.
         """
-        flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
         try:
-            image = cv2.imdecode(np.frombuffer(encoded, np.uint8), flags) if encoded else None
-        except cv2.error:
-            image = None
-        if image is None:
+            image = decode_image(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        except ValueError:
             return name, None
-        keypoints, descriptors = detect_keypoints(np.asarray(image, np.uint8), create_detector(detector, max_keypoints))
+        keypoints, descriptors = detect_keypoints(image, create_detector(detector, max_keypoints))
         values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float32).reshape(-1, 4)
         height, width = image.shape[:2]
         return name, ImageFeatures(values[:, :2], values[:, 2], values[:, 3], descriptors, None, (width, height))

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import os
 import resource
 import signal
-import sqlite3
-import time
+import subprocess
+import sys
 
 import cv2
 import h5py
 import numpy as np
 import pytest
-from pipeline_command import K_WORDS, assert_one_line, start_command
+from conftest import METADATA, build_model
+from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.integrations.folder import FolderJob
 from mgca_filter.integrations.folder_pairs import exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
@@ -137,6 +140,7 @@ def test_misuse_is_one_line(image_folder, tmp_path, capsys):
         (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "--address", "auto"], "--engine ray"),
         (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "-j", "0"], "--jobs"),
         (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "--pairs", "none.txt"], "none.txt"),
+        (["folder", str(image_folder), "-o", str(tmp_path / "o.h5"), "-j", "2", "--model", "no.onnx"], "no.onnx"),
     ):
         assert cli.main(words) == 2
         assert_one_line(capsys.readouterr(), message)
@@ -153,39 +157,32 @@ def test_a_file_of_the_subcommands_name_is_an_image(tmp_path, monkeypatch, capsy
     assert_one_line(capsys.readouterr(), "folder: no images")
 
 
-def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected):
-    """kill -9 after the first rows: the second run does the others only, and gives the same file."""
-    output, journal = tmp_path / "out.jsonl", tmp_path / "out.jsonl.work" / "journal.db"
-    process = start_command("folder", image_folder, "-o", output, *OPTIONS)
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline and process.poll() is None and journal_rows(journal) < 2:
-        time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    process.communicate()
-    done = journal_rows(journal)
-    assert 2 <= done < 6
+KILLED_AFTER_TWO_ROWS = """
+import os, signal, sys
+from mgca_filter import cli
+from mgca_filter.integrations.journal import Journal
+add, rows = Journal.add, []
+def add_and_die(journal, row):
+    add(journal, row)
+    rows.append(row)
+    if len(rows) == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+Journal.add = add_and_die
+cli.main(sys.argv[1:])
+"""
+
+
+def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected, capsys):
+    """kill -9 after two rows: the second run does the others only, and gives the same file."""
+    output = tmp_path / "out.jsonl"
+    command = [sys.executable, "-c", KILLED_AFTER_TWO_ROWS, "folder", str(image_folder), "-o", str(output), *OPTIONS]
+    killed = subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True, text=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert not output.exists()
-    second = start_command("folder", image_folder, "-o", output, *OPTIONS[:-1])
-    out, err = second.communicate()
-    assert second.returncode == 0, err
-    assert f"({done} were done before)" in out
+    assert cli.main(["folder", str(image_folder), "-o", str(output), *OPTIONS[:-1]]) == 0
+    assert "(2 were done before)" in capsys.readouterr().out
     assert output.read_text() == expected
-    assert not journal.exists()
-
-
-def journal_rows(path) -> int:
-    """Rows in a journal, from its write-ahead log: the run holds the lock while it lives."""
-    log = path.with_name(path.name + "-wal")
-    if not log.exists():
-        return 0
-    copy = path.with_name("look.db")
-    for suffix in ("", "-wal"):
-        copy.with_name(copy.name + suffix).write_bytes(path.with_name(path.name + suffix).read_bytes())
-    try:
-        with sqlite3.connect(copy) as database:
-            return database.execute("SELECT COUNT(*) FROM pair_rows").fetchone()[0]
-    except sqlite3.Error:
-        return 0
+    assert not (tmp_path / "out.jsonl.work").exists()
 
 
 def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
@@ -199,6 +196,32 @@ def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
     journal.close()
     assert run(image_folder, tmp_path / "out.jsonl") == 2
     assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 2.0 instead of 1.0")
+
+
+def test_resume_with_another_model_of_the_same_name_is_refused(image_folder, tmp_path, monkeypatch, capsys):
+    """A killed run leaves its rows; the same command with other weights in the same file must not add to them."""
+    model, output = tmp_path / "m.onnx", tmp_path / "out.jsonl"
+    few = ["--model", model, "--pairs", "sequential", "--overlap", 1]
+    build_model(model)
+    first = model.read_bytes()
+    with monkeypatch.context() as patch:
+        patch.setattr(FolderJob, "_write", lambda *arguments: pytest.fail("killed"))
+        with pytest.raises(pytest.fail.Exception):
+            run(image_folder, output, *few)
+    build_model(model, {**METADATA, "version": "1"})
+    assert run(image_folder, output, *few) == 2
+    assert_one_line(capsys.readouterr(), "out.jsonl.work", "model_sha256", "delete it or resume that run")
+    model.write_bytes(first)
+    assert cli.main(["folder", str(image_folder), "-o", str(output), "--K", K_WORDS, *map(str, few)]) == 0
+    assert "(3 were done before)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("output", "package", "extra"), [("o.h5", "h5py", "hloc"), ("o.db", "pycolmap", "colmap")])
+def test_a_missing_package_is_told_before_the_work(image_folder, tmp_path, monkeypatch, capsys, output, package, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert run(image_folder, tmp_path / output) == 2
+    assert_one_line(capsys.readouterr(), package, f"mgca_filter[{extra}]")
+    assert not list(tmp_path.glob("*.work"))
 
 
 def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path, expected):
