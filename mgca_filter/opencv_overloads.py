@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from inspect import signature
+from inspect import Parameter, signature
 from typing import Any
 
 import cv2
@@ -15,19 +15,23 @@ def call_overload(
 ) -> Any:
     """Call the first overload that the arguments fit, by number, name and kind.
 
+    None stands for the default of a parameter that has one, as in OpenCV's bindings.
+
     Raises:
         TypeError: they fit none; the message lists the overloads.
     """
     for overload in overloads:
+        parameters = signature(overload).parameters
         try:
-            bound = signature(overload).bind(*args, **kwargs)
+            bound = signature(overload).bind(*args, **kwargs).arguments
         except TypeError:
             continue
-        if all(_KINDS.get(parameter, _anything)(value) for parameter, value in bound.arguments.items()):
-            return overload(*args, **kwargs)
+        given = {n: v for n, v in bound.items() if v is not None or parameters[n].default is Parameter.empty}
+        if all(_KINDS.get(parameter, _anything)(value) for parameter, value in given.items()):
+            return overload(**given)
     forms = "; ".join(f"{name}({', '.join(signature(overload).parameters)})" for overload in overloads)
-    given = ", ".join([type(value).__name__ for value in args] + [f"{k}={type(v).__name__}" for k, v in kwargs.items()])
-    raise TypeError(f"{name}: ({given}) fits none of the overloads: {forms}")
+    types = ", ".join([type(value).__name__ for value in args] + [f"{k}={type(v).__name__}" for k, v in kwargs.items()])
+    raise TypeError(f"{name}: ({types}) fits none of the overloads: {forms}")
 
 
 def _anything(value: Any) -> bool:
@@ -51,7 +55,7 @@ def _is_coefficients(value: Any) -> bool:
 
 
 def _is_mask(value: Any) -> bool:
-    return value is None or isinstance(value, np.ndarray)
+    return isinstance(value, np.ndarray)
 
 
 def _is_point(value: Any) -> bool:

@@ -48,6 +48,21 @@ def test_every_overload_of_this_opencv_has_a_twin(original: Callable, twins: lis
         assert names in [list(inspect.signature(twin).parameters) for twin in twins]
 
 
+def test_none_stands_for_a_default_as_in_opencv(scene: Scene) -> None:
+    """Scripts written for the signature of OpenCV 4.4 give the mask, None, where newer ones have maxIters."""
+    points = scene.points1, scene.points2
+    for function, arguments in (
+        (findEssentialMat, (K, cv2.RANSAC, 0.999, 1.0, None)),
+        (findEssentialMat, (K, None, None, None, None, None)),
+        (findFundamentalMat, (cv2.FM_RANSAC, 3.0, 0.99, None)),
+        (findFundamentalMat, (None, None, None)),
+    ):
+        getattr(cv2, function.__name__)(*points, *arguments)
+        defaults = function(*points, *[value for value in arguments if value is K])
+        for answer, expected in zip(function(*points, *arguments), defaults):
+            np.testing.assert_array_equal(answer, expected)
+
+
 def test_essential_matrix_is_what_opencv_users_expect(scene: Scene) -> None:
     E, mask = findEssentialMat(scene.points1, scene.points2, K, cv2.RANSAC, 0.999, 1.0)
     assert E.shape == (3, 3)
