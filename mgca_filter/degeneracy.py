@@ -7,7 +7,8 @@ Every rule asks for nearly all of the evidence, so that an ordinary pair stays `
 - *Line*: a line in one of the images explains 95 % of the inliers to twice the inlier threshold.
 - *Rotation*: so does a rotation alone. *Plane*: so does a homography. Wrong matches that agree with the model
   by accident, about as many as the same rate foretells, are left out of the 95 %.
-- *Intrinsics*: a fundamental matrix, which needs none, explains far more of the fitted matches than E does.
+- *Intrinsics*: a fundamental matrix, which needs none, explains far more of the fitted matches than E does; or they
+  agree markedly better under another focal length (``focal_check.py``).
 """
 
 from __future__ import annotations

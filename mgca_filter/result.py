@@ -43,7 +43,8 @@ class FilterResult:
         info: ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``homography`` (3, 3)
             where one explains the pair, ``fitted_essential`` (3, 3) or None as the robust fit left it, before the
-            verdict, and what else a step wants to tell.
+            verdict, ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a
+            power of 1.2), and what else a step wants to tell.
     """
 
     mask: NDArray[np.bool_]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from . import degeneracy
 from .epipolar import fundamental_from_essential, sampson_distance
+from .focal_check import better_focal_factor
 from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, homography_distance
 from .pair_input import PairInput
 from .ranking import RankedMatches
@@ -73,6 +74,9 @@ def judge(
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
     if support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA:
         return replace(verdict, status=Status.LOW_SUPPORT)
+    factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
+    if factor is not None:
+        return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
     return _test_degenerate(pair, inlier_rows, support, mask_threshold_px, options, verdict)
 
 

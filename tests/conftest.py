@@ -49,10 +49,14 @@ class Scene:
 
 
 def make_scene(kind: str = "general", right: int = 120, wrong: int = 80, noise_px: float = 0.3, seed: int = 0) -> Scene:
-    """A scene of ``kind`` general, wide, planar, rotation or collinear, with wrong matches drawn at random."""
+    """A scene of ``kind`` general, wide, skew, planar, rotation or collinear, with wrong matches drawn at random.
+
+    In skew the viewing axes pass each other, so that the matches determine the focal length.
+    """
     rng = np.random.default_rng(seed)
     R = rotation_from_vector(np.array([0.1, -0.5, 0.1]) if kind == "wide" else np.array([0.05, -0.12, 0.03]))
-    t = {"rotation": np.zeros(3), "wide": np.array([3.0, 0.3, 1.0])}.get(kind, np.array([1.0, 0.2, 0.1]))
+    move = {"rotation": [0.0, 0.0, 0.0], "wide": [3.0, 0.3, 1.0], "skew": [1.0, 0.6, 0.5]}.get(kind, [1.0, 0.2, 0.1])
+    t = np.array(move)
     pixels = rng.uniform([20, 20], [620, 460], (right, 2))
     depth = rng.uniform(4, 11, right)
     if kind == "planar":  # 1 / depth is affine in the pixels on any plane

@@ -7,8 +7,11 @@ import pytest
 from conftest import SIZE, K, Scene, make_scene
 
 from mgca_filter import FilterResult, MatchFilter, Status
+from mgca_filter.correspondences import normalize_points
 from mgca_filter.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
 from mgca_filter.epipolar import pose_error_deg, rotation_error_deg
+from mgca_filter.focal_check import FOCAL_STEP, better_focal_factor
+from mgca_filter.pose_refinement import refine_pose
 
 
 def run(match_filter: MatchFilter, scene: Scene, **options: object) -> FilterResult:
@@ -119,3 +122,40 @@ def test_line_and_rotation_fits_set_outliers_aside() -> None:
     scene = make_scene("rotation", right=100, wrong=10, noise_px=0.0)
     rows = np.hstack([(p - K[:2, 2]) / K[0, 0] for p in (scene.points1, scene.points2)])
     assert rotation_error_deg(fit_rotation(rows, 1 / K[0, 0]), scene.R) < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("factor", [0.7, 1.5])
+def test_wrong_focal_length_is_suspected_and_told(match_filter: MatchFilter, factor: float, seed: int) -> None:
+    scene = make_scene("skew", right=200, wrong=40, seed=seed)
+    wrong_K = K * np.array([[factor, factor, 1.0], [1.0, factor, 1.0], [1.0, 1.0, 1.0]])
+    result = run(match_filter, scene, K1=wrong_K)
+    assert result.status is Status.SUSPICIOUS_INTRINSICS
+    assert abs(np.log(result.info["focal_factor"] * factor)) < 1.5 * np.log(FOCAL_STEP)
+    assert result.E is not None
+    assert "focal_factor" not in run(match_filter, scene).info
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["general", "wide", "skew", "planar"])
+def test_right_focal_length_will_do(kind: str, seed: int) -> None:
+    scene = make_scene(kind, right=300, wrong=0, noise_px=0.5, seed=seed)
+    x = np.hstack([normalize_points(scene.points1, K), normalize_points(scene.points2, K)])
+    assert better_focal_factor(x, scene.R, scene.t, 1.0 / K[0, 0]) is None
+
+
+@pytest.mark.parametrize("scale", [0.7, 1.5])
+def test_better_focal_factor_undoes_a_scale(scale: float) -> None:
+    scene = make_scene("skew", right=300, wrong=30, seed=1)
+    x = np.hstack([normalize_points(scene.points1, K), normalize_points(scene.points2, K)]) * scale
+    threshold = scale / K[0, 0]
+    pose = refine_pose(x, scene.R, scene.t, 20.0 * threshold)
+    factor = better_focal_factor(x, *refine_pose(x, *pose, threshold), threshold)
+    assert factor is not None
+    assert abs(np.log(factor / scale)) < 1.5 * np.log(FOCAL_STEP)
+
+
+@pytest.mark.parametrize("count", [0, 3, 20])
+def test_hopeless_matches_ask_for_no_other_focal_length(count: int) -> None:
+    scene = make_scene()
+    assert better_focal_factor(np.zeros((count, 4)), scene.R, scene.t, 1.0 / K[0, 0]) is None

@@ -25,7 +25,7 @@ from ..scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED, mean_average_precision
 from .pairs import draw_indices
 
-FACTORS = (0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5)
+FACTORS = (0.5, 0.7, 0.8, 0.9, 1.0, 1.1, 1.25, 1.5, 2.0)
 # A true match this close to its epipolar line is placed by a fundamental matrix that can be relied upon.
 CLOSE_PX = 2.0
 
