@@ -21,9 +21,14 @@ def test_the_file_appears_when_the_block_is_done(tmp_path: Path) -> None:
 def test_an_interrupted_block_leaves_the_old_file_alone(tmp_path: Path) -> None:
     path = tmp_path / "out.json"
     path.write_text("old")
-    with pytest.raises(KeyboardInterrupt), replaced_when_done(path) as partial:
-        partial.write_text("half")
-        raise KeyboardInterrupt
+
+    def write_half() -> None:
+        with replaced_when_done(path) as partial:
+            partial.write_text("half")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_half()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

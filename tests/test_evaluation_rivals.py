@@ -1,4 +1,4 @@
-"""Rivals of other libraries, the network's order, and estimators with the filter's milliseconds."""
+"""Rivals of other libraries, and the network's order."""
 
 from __future__ import annotations
 
@@ -16,13 +16,10 @@ from scene_bundles import write_bundle
 from mgca_filter import filter_matches
 from mgca_filter.correspondences import MatchAttributes
 from mgca_filter.epipolar import pose_error_deg
-from mgca_filter.evaluation import time_matching
 from mgca_filter.evaluation.__main__ import main
-from mgca_filter.evaluation.methods import Answer
 from mgca_filter.evaluation.predict import evaluate_pair
 from mgca_filter.evaluation.registry import GRID_ROWS, TIME_MATCHED_ROWS, parse_method
 from mgca_filter.evaluation.selection import Selection
-from mgca_filter.evaluation.time_matching import match_times
 from mgca_filter.scene_bundle import ScenePair
 
 ORDERED = "mutual + ratio 0.9 + network order + PROSAC 0.5 px"
@@ -158,86 +155,3 @@ def test_what_is_not_installed_is_listed_and_the_rest_runs(
     assert "NN + MAGSAC 1 px" in text
     assert main(arguments) == 2
     assert "pydegensac" in capsys.readouterr().err
-
-
-# Time-matched rows
-
-
-class ClockedMethod:
-    """Takes a time that is a function of its iterations, on the clock that the test puts in."""
-
-    seeded = False
-
-    def __init__(self, name: str, milliseconds: float, clock: list[float]) -> None:
-        self.name, self._milliseconds, self._clock = name, milliseconds, clock
-
-    def settings(self) -> dict[str, Any]:
-        return {}
-
-    def run(self, pair: ScenePair, seed: int) -> Answer:
-        self._clock[0] += self._milliseconds / 1e3
-        nothing = np.zeros(len(pair.points1), dtype=bool)
-        return Answer(None, None, nothing, nothing, "clocked")
-
-
-@pytest.fixture
-def clocked(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Makes methods whose rows cost what ``cost`` says of their iterations; gives the one to match."""
-    from mgca_filter.evaluation import predict
-
-    clock = [0.0]
-    monkeypatch.setattr(predict.time, "perf_counter", lambda: clock[0])
-
-    def install(cost: Any, target_ms: float) -> ClockedMethod:
-        def build(name: str) -> ClockedMethod:
-            iterations = int(name.split()[-2])
-            return ClockedMethod(name, cost(iterations), clock)
-
-        monkeypatch.setattr(time_matching, "parse_method", build)
-        return ClockedMethod("ours", target_ms, clock)
-
-    return install
-
-
-@pytest.mark.parametrize(("target_ms", "per_thousand"), [(50.0, 3.0), (50.0, 400.0), (8.0, 8.0)])
-def test_iterations_are_found_that_take_our_time(target_ms: float, per_thousand: float, clocked: Any, pair: ScenePair):
-    like = clocked(lambda iterations: per_thousand * iterations / 1000, target_ms)
-    (match,) = match_times(["NN + MAGSAC 1 px"], like, [pair])
-    assert match.reached_ms == pytest.approx(target_ms, rel=0.2)
-    assert match.reached_ms == pytest.approx(per_thousand * match.iterations / 1000)
-    assert match.method == f"NN + MAGSAC 1 px {match.iterations} iterations"
-    assert (match.like, match.target_ms) == ("ours", pytest.approx(target_ms))
-
-
-def test_an_estimator_that_stops_early_says_so(clocked: Any, pair: ScenePair):
-    like = clocked(lambda iterations: min(iterations / 1000, 5.0), 50.0)
-    (match,) = match_times(["NN + MAGSAC 1 px"], like, [pair])
-    assert match.reached_ms == pytest.approx(5.0)
-    assert match.iterations == 16_000  # the most that was tried before it was given up
-    like = clocked(lambda iterations: 100.0, 50.0)
-    assert match_times(["NN + MAGSAC 1 px"], like, [pair])[0].iterations == time_matching.MIN_ITERATIONS
-
-
-def test_the_iterations_found_are_kept(clocked: Any, pair: ScenePair, tmp_path: Path):
-    first = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: i / 1000, 50.0), [pair], tmp_path)
-    again = match_times(["NN + MAGSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
-    assert again == first
-    threads = cv2.getNumThreads()
-    other = match_times(["NN + RANSAC 1 px"], clocked(lambda i: 9 * i / 1000, 70.0), [pair], tmp_path)
-    assert other[0].target_ms == pytest.approx(70.0)
-    assert cv2.getNumThreads() == threads
-
-
-def test_command_adds_time_matched_rows(
-    tmp_path: Path, model_file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    import mgca_filter.evaluation.__main__ as command
-
-    monkeypatch.setattr(command, "TIME_MATCHED_ROWS", ("mutual + PROSAC 0.5 px",))
-    monkeypatch.setattr(time_matching, "MAX_ITERATIONS", 2000)
-    path = write_bundle(tmp_path / "hall.npz", [make_scene()])
-    arguments = [str(path), "--methods", "product", "--model", str(model_file), "--time-matched", "product"]
-    assert main([*arguments, "--bootstrap", "0", "-q"]) == 0
-    text = capsys.readouterr().out
-    assert "iterations take" in text
-    assert "mutual + PROSAC 0.5 px " in text

@@ -123,6 +123,14 @@ def test_workers_do_not_change_the_numbers_of_a_dump(broken: int, tmp_path: Path
         assert [o.unreadable for o in other] == [index == broken for index in range(3)]
 
 
+def test_a_bundle_pair_without_translation_cannot_be_judged(tmp_path: Path):
+    path = write_bundle(tmp_path / "hall.npz", [make_scene("rotation"), make_scene()])
+    (source,) = open_sources([path])
+    with pytest.raises(DatasetError, match=r"hall\.npz: pair 0: the translation is zero"):
+        source[0]
+    assert source[1].index == 1
+
+
 # Lists of image pairs
 
 

@@ -73,6 +73,23 @@ def test_auc_is_the_area_of_the_trapezoids():
     assert area_under_recall([3.0, FAILURE_DEG, 1.0, FAILURE_DEG], 2.0) == pytest.approx(0.375 / 2.0)
 
 
+@given(
+    st.lists(st.one_of(st.floats(0.0, 30.0), st.just(FAILURE_DEG)), min_size=1, max_size=40),
+    st.sampled_from([5.0, 10.0, 20.0]),
+)
+def test_auc_equals_the_trapezoids_of_the_sorted_errors(errors, limit):
+    below = sorted(error for error in errors if error < limit)
+    recall = [i / len(errors) for i in range(len(below) + 1)]
+    area = np.trapezoid([*recall, recall[-1]], [0.0, *below, limit])
+    assert area_under_recall(errors, limit) == pytest.approx(area / limit)
+
+
+def test_figures_of_many_resamples_at_once_are_those_of_each():
+    errors = np.random.default_rng(0).uniform(0.0, 30.0, (4, 3, 17))
+    for statistic in (*POSE_STATISTICS.values(), median_error):
+        np.testing.assert_allclose(statistic(errors), [statistic(one) for one in errors])
+
+
 def test_auc_at_its_bounds():
     assert area_under_recall([0.0, 0.0], 5.0) == pytest.approx(1.0)
     assert area_under_recall([FAILURE_DEG, 90.0], 20.0) == 0.0

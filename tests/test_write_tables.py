@@ -11,13 +11,13 @@ from export_tools import load_export_module
 ROWS = {"mAP@5": 50.0, "mAP@20": 61.3, "AUC@5": 30.0, "AUC@10": 40.0, "AUC@20": 50.0, "P": 12.0, "R": 90.0, "F": 20.0}
 SUMMARY = {
     "rows": [
-        {"method": method, "scene": scene, "pairs": 3, **ROWS, "median_ms": 7.0}
+        {"method": method, "scene": scene, "pairs": 3, **ROWS, "median_ms": 7.0, "timed_pairs": 2}
         for method in ("NN + MAGSAC 0.5 px", "product")
         for scene in ("hall", "all", "pairs")
     ],
     "versions": {"opencv-contrib-python-headless": "5.0.0"},
     "machine": {"processor": "Abacus"},
-    "timing": {"share_on_busy_machine": 0.0},
+    "timing": {"machine": "Abacus", "others_load": 0.0},
 }
 
 
@@ -36,6 +36,8 @@ def test_tables_and_figures_are_written(tmp_path: Path):
         assert "stale table" not in text
         assert "| **mgca_filter**, default options | 50.0 | 61.3 |" in text
         assert "all 3 pairs of 1 scenes" in text
+        assert "median over 2 pairs" in text
+        assert "times are rough" not in text
     assert (tmp_path / script.FIGURES / "time_accuracy.svg").exists()
     (tmp_path / "README.md").write_text("no markers")
     with pytest.raises(SystemExit, match=r"README\.md: no scoreboard markers"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MgcaFilterError
-from .environment import library_versions, machine_description, source_commit
+from .environment import library_versions, machine_description, one_thread, source_commit
 from .figures import draw_figures, is_ours
 from .methods import Method
 from .pairs import SceneSelection, sample_pairs, select_pairs
@@ -23,9 +24,13 @@ from .report import format_report
 from .sources import FORMATS
 from .store import ResultStore
 from .summary import ALL_SCENES, choose_reference, summarize
-from .time_matching import SAMPLE_PAIRS, TimeMatch, match_times
+from .time_matching import TimeMatch, match_times
+from .timing import time_methods
 
 logger = logging.getLogger(__name__)
+
+MATCHING_PAIRS = 60
+"""Pairs, evenly from all scenes, on which iterations are looked for that take the time of a row of ours."""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -59,8 +64,13 @@ def build_parser() -> argparse.ArgumentParser:
         help="also run robust estimators with the milliseconds that this row of ours takes, such as 'product'",
     )
     parser.add_argument("--model", metavar="FILE", help="model of the product rows (default: the one in the package)")
+    parser.add_argument("--workers", type=_positive, default=1, metavar="N", help="processes (default 1)")
     parser.add_argument(
-        "--workers", type=_positive, default=1, metavar="N", help="processes (default 1; more disturb the times)"
+        "--times",
+        type=_count,
+        default=10,
+        metavar="N",
+        help="pairs of each scene on which all rows are timed in turn, on one thread (default 10; 0 = no times)",
     )
     parser.add_argument(
         "--seeds", type=_positive, default=3, metavar="N", help="runs of randomised estimators (default 3)"
@@ -68,7 +78,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the draw of pairs and of the bootstrap (default 0)")
     parser.add_argument("--store", metavar="DIR", help="keep results here, and take from here what is known")
     parser.add_argument("--reference", metavar="NAME", help="row that the others are compared with (default: product)")
-    parser.add_argument("--bootstrap", type=int, default=1000, metavar="N", help="replicates; 0 = no intervals")
+    parser.add_argument("--bootstrap", type=_count, default=1000, metavar="N", help="replicates; 0 = no intervals")
     parser.add_argument(
         "--json", metavar="FILE", help="write the figures here ('-' = standard output, tables left out)"
     )
@@ -87,11 +97,17 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> int:
+def _count(text: str) -> int:
     value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError("must be at least 1")
+    if value < 0:
+        raise argparse.ArgumentTypeError("must be at least 0")
     return value
+
+
+def _positive(text: str) -> int:
+    if _count(text) == 0:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return int(text)
 
 
 def _expand(names: Sequence[str] | None) -> list[str]:
@@ -107,7 +123,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=logging.WARNING if options.quiet else logging.INFO, format="%(message)s", stream=sys.stderr
     )
     try:
-        run(options)
+        with one_thread():
+            run(options)
     except (MgcaFilterError, ValueError, ImportError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -131,15 +148,18 @@ def run(options: argparse.Namespace) -> None:
         rivals, lacking = _installed([parse_method(name) for name in TIME_MATCHED_ROWS])
         like = parse_method(options.time_matched, options.model)
         names = [rival.name for rival in rivals]
-        time_matched = match_times(names, like, sample_pairs(selections, SAMPLE_PAIRS), store.folder)
+        sample = sample_pairs(selections, math.ceil(MATCHING_PAIRS / len(selections)))
+        time_matched = match_times(names, like, sample, store)
         methods += [parse_method(match.method) for match in time_matched]
         not_installed += lacking
     results = predict(
         methods, selections, seeds=options.seeds, workers=options.workers, store=store, progress=not options.quiet
     )
+    timing = time_methods(methods, sample_pairs(selections, options.times), store) if options.times else None
     context = {**_context(options, selections, methods), "not_installed": not_installed}
     context["time_matched"] = [asdict(match) for match in time_matched]
-    summary = summarize(results, context, reference=options.reference, replicates=options.bootstrap, seed=options.seed)
+    settings = {"reference": options.reference, "replicates": options.bootstrap, "seed": options.seed}
+    summary = summarize(results, context, timing, **settings)
     _write(options, summary)
     if options.figures:
         draw_figures(summary, options.figures)

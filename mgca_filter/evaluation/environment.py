@@ -6,14 +6,21 @@ import os
 import platform
 import subprocess
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+import cv2
+
+from ..backends.onnx_backend import THREADS_VARIABLE
 
 PACKAGES = (
     *("numpy", "opencv-contrib-python-headless", "opencv-contrib-python", "onnxruntime", "mgca-filter"),
     *("poselib", "pydegensac", "kornia", "torch", "pycolmap"),
 )
-BUSY_SHARE = 0.25
+BUSY_LOAD = 0.25
+"""Processors used by other programs from which on times are not to be relied upon."""
 
 
 def processor_name() -> str:
@@ -64,25 +71,43 @@ def _git(folder: Path, *arguments: str) -> str:
     return done.stdout.strip()
 
 
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """OpenCV, and sessions of ONNX Runtime that are opened within the block, keep to one thread.
+
+    The number of threads changes no figure but the times, in which rivals have one thread too.
+    """
+    opencv_threads, onnx_threads = cv2.getNumThreads(), os.environ.get(THREADS_VARIABLE)
+    cv2.setNumThreads(1)
+    os.environ[THREADS_VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(opencv_threads)
+        os.environ.pop(THREADS_VARIABLE)
+        if onnx_threads is not None:
+            os.environ[THREADS_VARIABLE] = onnx_threads
+
+
 class CpuMeter:
-    """Tells whether other programs worked beside this process since the meter was made."""
+    """Tells how much other programs worked beside this process since the meter was made."""
 
     def __init__(self) -> None:
         self._start = (time.perf_counter(), time.process_time(), _machine_cpu_seconds())
 
-    def others_were_busy(self) -> bool:
-        """True where other programs used more than a quarter of a processor on average.
+    def others_load(self) -> float:
+        """Number of processors that other programs used, on average.
 
-        The count is Linux's (``/proc/stat``); elsewhere the load average stands in for it.
+        The count is Linux's (``/proc/stat``); elsewhere the load average stands in for it, and 0 where there is none.
         """
         wall, own, machine = self._start
         elapsed = time.perf_counter() - wall
         now = _machine_cpu_seconds()
         if machine is None or now is None:
-            return hasattr(os, "getloadavg") and os.getloadavg()[0] > 1.0 + BUSY_SHARE
+            return max(os.getloadavg()[0] - 1.0, 0.0) if hasattr(os, "getloadavg") else 0.0
         # The kernel counts in ticks of 10 ms on every processor, of which a short measurement must not make much.
         others = now - machine - (time.process_time() - own) - 0.05
-        return others > BUSY_SHARE * elapsed
+        return max(others, 0.0) / elapsed
 
 
 def _machine_cpu_seconds() -> float | None:

@@ -52,7 +52,7 @@ def draw_figures(summary: Mapping[str, Any], folder: str | Path, prefix: str = "
         "recall": (draw_recall, "recall" in curves),
         "precision_recall": (draw_precision_recall, bool(curves.get("precision_recall", {}).get("methods"))),
         "reliability": (draw_reliability, bool(curves.get("reliability"))),
-        "time_accuracy": (draw_time_accuracy, True),
+        "time_accuracy": (draw_time_accuracy, any("median_ms" in row for row in _headline(summary))),
     }
     files = []
     with matplotlib.rc_context(_STYLE):
@@ -107,7 +107,8 @@ def draw_reliability(axes: Any, summary: Mapping[str, Any]) -> None:
 
 def draw_time_accuracy(axes: Any, summary: Mapping[str, Any]) -> None:
     """mAP@20 over the median time of each row, both means over scenes; numbers refer to the legend."""
-    rows = sorted(_headline(summary), key=lambda row: -float(row["mAP@20"]))
+    timed = [row for row in _headline(summary) if "median_ms" in row]
+    rows = sorted(timed, key=lambda row: -float(row["mAP@20"]))
     for number, row in enumerate(rows, 1):
         ours = is_ours(row["method"])
         colour = "#1b7f4b" if ours else _GREY

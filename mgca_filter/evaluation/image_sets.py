@@ -10,13 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..keypoints import detect_keypoints
 from ..scene_bundle import SceneBundle, ScenePair
 from ..training.worlds.photographs import PhotoFolder
 from ..training.worlds.view_pairs import match_views as match_rendered
 from ..training.worlds.views import draw_views
 from .sources.base import Image, check_folder, read_image
-from .sources.image_features import ImageFeatures, View, match_views
+from .sources.image_features import View, describe, match_views
 
 Array = NDArray[np.float64]
 
@@ -93,11 +92,8 @@ def _cameras(pair: ScenePair) -> Sequence[tuple[str, Array, tuple[int, int]]]:
 
 
 def _view(name: str, image: Image, K: Array, detector: cv2.Feature2D) -> View:
-    keypoints, descriptors = detect_keypoints(image, detector, name)
-    values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64).reshape(-1, 4)
-    diameter, angle = values[:, 2].astype(np.float32), values[:, 3].astype(np.float32)
-    size = (image.shape[1], image.shape[0])
-    return View(name, ImageFeatures(size, values[:, :2], diameter, angle, descriptors), values[:, :2], K)
+    features = describe(image, detector, name)
+    return View(name, features, features.points, K)
 
 
 def _rescaled(K: Array, size: tuple[int, int], now: tuple[int, ...]) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -87,11 +87,8 @@ class PairOutcome:
         error_deg: pose error; 180 where there is no pose.
         rotation_deg, translation_deg: its two parts; None where there is no pose.
         kept, mask: (precision, recall, F) of the decision before and after the robust fit, all matches counted.
-        elapsed_ms, cpu_ms: wall-clock and processor time of filter and estimator; 0 where the pair was unreadable.
         failure: empty, or why there is no pose; ``error: …`` where the method raised, ``unreadable: …`` where the pair
             could not be read.
-        busy: other programs were using the machine, so that ``elapsed_ms`` says little.
-        machine: the processor's name.
         paper: (precision, recall, F) at logit > 2, for methods that have logits.
         counts: right and wrong matches over the scores, likewise.
     """
@@ -102,11 +99,7 @@ class PairOutcome:
     translation_deg: float | None
     kept: tuple[float, float, float]
     mask: tuple[float, float, float]
-    elapsed_ms: float
-    cpu_ms: float
     failure: str = ""
-    busy: bool = False
-    machine: str = field(default="", compare=False)
     paper: tuple[float, float, float] | None = None
     counts: ScoreCounts | None = None
 
@@ -116,9 +109,9 @@ class PairOutcome:
         return self.failure.startswith(UNREADABLE)
 
     @classmethod
-    def from_json(cls, fields: dict[str, Any]) -> PairOutcome:
-        """Outcome from the fields that ``dataclasses.asdict`` gave; those of older results may lack the last two."""
-        values = dict(fields)
+    def from_json(cls, content: dict[str, Any]) -> PairOutcome:
+        """Outcome from what ``dataclasses.asdict`` gave; older results may hold other fields and lack the last two."""
+        values = {field.name: content[field.name] for field in fields(cls) if field.name in content}
         for name in ("kept", "mask", "paper"):
             if values.get(name) is not None:
                 values[name] = tuple(values[name])

@@ -2,24 +2,29 @@
 
 Pose errors are degrees; a pair without a pose has :data:`FAILURE_DEG`. Errors of a method on one scene come as
 (S, P): S runs of a randomised estimator with different seeds over P pairs. Every figure is computed per run and
-averaged over the runs. Shares and areas are 0 … 1 here; :mod:`report` prints them in per cent.
+averaged over the runs; errors (…, S, P) give figures (…). Shares and areas are 0 … 1 here; :mod:`report` prints them
+in per cent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 FloatArray = NDArray[np.float64]
-Statistic = Callable[[FloatArray], float]
+Figures = Any  # a float for errors (P,) or (S, P), an array (…) of them for errors (…, S, P)
+Statistic = Callable[[FloatArray], Figures]
 SceneErrors = Mapping[str, FloatArray]
 
 FAILURE_DEG = 180.0
 MAP_STEP_DEG = 5
 PAPER_LOGIT = 2.0
 """Logit above which the published evaluations of this family accept a match."""
+
+_REPLICATES_AT_ONCE = 50
 
 TRUE_INLIER_DISTANCE_SQUARED = 1e-4
 """Squared symmetric epipolar distance on the normalised planes below which a match counts as a true inlier."""
@@ -55,16 +60,21 @@ def mean_of_the_nonzero(values: ArrayLike) -> tuple[float, int]:
     return (float(counted.mean()) if len(counted) else 0.0), len(array) - len(counted)
 
 
-def share_below(errors_deg: ArrayLike, limit_deg: float) -> float:
+def _runs(errors_deg: ArrayLike) -> FloatArray:
+    """Errors (P,) or (…, S, P) as (…, S, P)."""
+    return np.atleast_2d(np.asarray(errors_deg, dtype=np.float64))
+
+
+def share_below(errors_deg: ArrayLike, limit_deg: float) -> Figures:
     """Share of the pairs whose pose error is below ``limit_deg``, 0 … 1."""
-    return float(np.mean(np.asarray(errors_deg, dtype=np.float64) < limit_deg))
+    return np.mean(_runs(errors_deg) < limit_deg, axis=(-2, -1))
 
 
-def mean_average_precision(errors_deg: ArrayLike, limit_deg: int) -> float:
+def mean_average_precision(errors_deg: ArrayLike, limit_deg: int) -> Figures:
     """mAP@limit: mean of the shares below 5, 10, … ``limit_deg`` degrees (so mAP@5 is the share below 5).
 
     Args:
-        errors_deg: pose errors, any shape; seeds and pairs weigh the same.
+        errors_deg: pose errors (P,) or (…, S, P).
         limit_deg: a multiple of 5.
 
     Raises:
@@ -73,29 +83,27 @@ def mean_average_precision(errors_deg: ArrayLike, limit_deg: int) -> float:
     if limit_deg < MAP_STEP_DEG or limit_deg % MAP_STEP_DEG:
         raise ValueError(f"limit_deg must be a positive multiple of {MAP_STEP_DEG}, got {limit_deg}")
     limits = range(MAP_STEP_DEG, limit_deg + 1, MAP_STEP_DEG)
-    return float(np.mean([share_below(errors_deg, limit) for limit in limits]))
+    return np.mean([share_below(errors_deg, limit) for limit in limits], axis=0)
 
 
-def area_under_recall(errors_deg: ArrayLike, limit_deg: float) -> float:
+def area_under_recall(errors_deg: ArrayLike, limit_deg: float) -> Figures:
     """AUC@limit: exact area under the recall curve up to ``limit_deg``, divided by it, 0 … 1.
 
     The curve of SuperGlue (Sarlin et al., CVPR 2020): straight lines from (0, 0) through (i-th smallest error, i / P),
-    level from the last error below the limit up to it. (S, P) errors give the mean over S.
+    level from the last error below the limit up to it.
     """
-    runs = np.atleast_2d(np.asarray(errors_deg, dtype=np.float64))
-    areas = []
-    for errors in np.sort(runs, axis=1):
-        below = errors[errors < limit_deg]
-        recall = np.arange(len(below) + 1) / len(errors)
-        x = np.concatenate([[0.0], below, [limit_deg]])
-        y = np.append(recall, recall[-1])
-        areas.append(np.sum(np.diff(x) * (y[1:] + y[:-1])) / 2.0)
-    return float(np.mean(areas) / limit_deg)
+    runs = _runs(errors_deg)
+    below = runs < limit_deg
+    # Summed by parts, the trapezoids give every error e below the limit (limit − e) / P, as steps would, and half the
+    # largest of them besides, which is what the slopes between the steps add up to.
+    steps = np.where(below, limit_deg - runs, 0.0).sum(axis=-1)
+    largest = np.where(below, runs, 0.0).max(axis=-1)
+    return np.mean(steps + largest / 2.0, axis=-1) / (runs.shape[-1] * limit_deg)
 
 
-def median_error(errors_deg: ArrayLike) -> float:
+def median_error(errors_deg: ArrayLike) -> Figures:
     """Median over the pairs, mean over the runs, degrees."""
-    return float(np.mean(np.median(np.atleast_2d(np.asarray(errors_deg, dtype=np.float64)), axis=1)))
+    return np.mean(np.median(_runs(errors_deg), axis=-1), axis=-1)
 
 
 POSE_STATISTICS: dict[str, Statistic] = {
@@ -111,7 +119,7 @@ POSE_STATISTICS: dict[str, Statistic] = {
 
 def mean_over_scenes(statistic: Statistic, errors: SceneErrors) -> float:
     """The headline: mean of the scenes' figures, each scene weighing the same whatever its size."""
-    return float(np.mean([statistic(scene_errors) for scene_errors in errors.values()]))
+    return float(np.mean([statistic(np.atleast_2d(scene_errors)) for scene_errors in errors.values()]))
 
 
 def pool_pairs(errors: SceneErrors) -> FloatArray:
@@ -121,7 +129,7 @@ def pool_pairs(errors: SceneErrors) -> FloatArray:
 
 def mean_over_pairs(statistic: Statistic, errors: SceneErrors) -> float:
     """The figure over the pairs of all scenes together, each pair weighing the same."""
-    return statistic(pool_pairs(errors))
+    return float(statistic(pool_pairs(errors)))
 
 
 def bootstrap_interval(
@@ -132,8 +140,7 @@ def bootstrap_interval(
     Pairs are drawn with replacement within their scene: the interval speaks of the chance in the choice of pairs, the
     scenes being what they are. All runs (seeds) of a drawn pair come along.
     """
-    values = _replicate_means([errors], statistic, replicates, seed)[0]
-    return _percentile_interval(values, level)
+    return percentile_interval(replicate_means(errors, statistic, replicates=replicates, seed=seed), level)
 
 
 def paired_bootstrap_interval(
@@ -157,26 +164,29 @@ def paired_bootstrap_interval(
     for scene in errors:
         if np.atleast_2d(errors[scene]).shape[1] != np.atleast_2d(baseline[scene]).shape[1]:
             raise ValueError(f"scene {scene}: the two methods were run on different numbers of pairs")
-    ours, theirs = _replicate_means([errors, baseline], statistic, replicates, seed)
-    return _percentile_interval(ours - theirs, level)
+    ours, theirs = (replicate_means(e, statistic, replicates=replicates, seed=seed) for e in (errors, baseline))
+    return percentile_interval(ours - theirs, level)
 
 
-def _replicate_means(methods: Sequence[SceneErrors], statistic: Statistic, replicates: int, seed: int) -> FloatArray:
-    """Means over scenes (methods, replicates) on resampled pairs, the same resample for every method."""
+def replicate_means(errors: SceneErrors, statistic: Statistic, *, replicates: int, seed: int) -> FloatArray:
+    """Means over scenes (replicates,) on resampled pairs.
+
+    Methods that were run on the same pairs see the same resamples under the same seed.
+    """
     generator = np.random.default_rng(seed)
-    means = np.zeros((len(methods), replicates))
-    scenes = list(methods[0])
-    for scene in scenes:
-        runs = [np.atleast_2d(method[scene]) for method in methods]
-        count = runs[0].shape[1]
-        for r in range(replicates):
-            rows = generator.integers(0, count, size=count)
-            for m, errors in enumerate(runs):
-                means[m, r] += statistic(errors[:, rows]) / len(scenes)
-    return means
+    means = np.zeros(replicates)
+    for scene_errors in errors.values():
+        runs = np.atleast_2d(scene_errors)
+        count = runs.shape[1]
+        for first in range(0, replicates, _REPLICATES_AT_ONCE):
+            block = slice(first, min(first + _REPLICATES_AT_ONCE, replicates))
+            rows = generator.integers(0, count, size=(block.stop - first, count))
+            means[block] += statistic(np.moveaxis(runs[:, rows], 0, 1))  # (replicates, S, P)
+    return means / len(errors)
 
 
-def _percentile_interval(values: FloatArray, level: float) -> tuple[float, float]:
+def percentile_interval(values: FloatArray, level: float = 0.95) -> tuple[float, float]:
+    """The interval that holds the share ``level`` of the values, equal shares outside on both sides."""
     tail = 50.0 * (1.0 - level)
     low, high = np.percentile(values, [tail, 100.0 - tail])
     return float(low), float(high)

@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from multiprocessing import get_context
 
-import cv2
 import numpy as np
 
 from ..epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
 from ..errors import DatasetError
 from ..scene_bundle import ScenePair
-from .environment import CpuMeter, processor_name
+from .environment import one_thread
 from .methods import UNREADABLE, Answer, Method, PairOutcome
 from .metrics import FAILURE_DEG, PAPER_LOGIT, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
 from .pairs import SceneSelection
@@ -30,7 +28,6 @@ logger = logging.getLogger(__name__)
 CHUNK_PAIRS = 40
 """Pairs between two writes to the store: what an interrupted run loses at most, per worker."""
 
-_warm_methods: set[str] = set()
 _read_pairs: OrderedDict[tuple[str, str, int], ScenePair | DatasetError] = OrderedDict()
 
 SceneOutcomes = dict[str, list[list[PairOutcome]]]
@@ -56,7 +53,7 @@ def predict(
 ) -> dict[str, SceneOutcomes]:
     """Outcomes of every method on every chosen pair, by name of the method and scene.
 
-    Results do not depend on ``workers``; times do. What the store knows already is not run again.
+    Results do not depend on ``workers``. What the store knows already is not run again.
 
     Args:
         methods: rows to run; names must differ.
@@ -128,12 +125,8 @@ def _missing_tasks(
 
 def _run_tasks(tasks: list[_Task], workers: int) -> Iterator[tuple[_Task, list[PairOutcome]]]:
     if workers == 1 or len(tasks) < 2:
-        threads = cv2.getNumThreads()
-        try:
-            for task in tasks:
-                yield task, _run_task(task)
-        finally:
-            cv2.setNumThreads(threads)
+        for task in tasks:
+            yield task, _run_task(task)
         return
     # Fresh interpreters: ONNX Runtime's and OpenCV's threads do not survive a fork.
     with ProcessPoolExecutor(min(workers, len(tasks)), mp_context=get_context("spawn")) as pool:
@@ -159,35 +152,22 @@ def _read_pair(source: PairSource, index: int) -> ScenePair | DatasetError:
     return _read_pairs[key]
 
 
-def _warm_up(method: Method, pair: ScenePair) -> None:
-    """Once per process and method, untimed: sessions are opened and buffers allocated outside the measurement."""
-    if repr(method) not in _warm_methods:
-        answer_pair(method, pair, 0)
-        _warm_methods.add(repr(method))
-
-
 def _run_task(task: _Task) -> list[PairOutcome]:
-    cv2.setNumThreads(1)
-    # All are read before the clock of the others' work starts: reading may take several threads.
-    pairs = [_read_pair(task.source, index) for index in task.indices]
-    readable = [pair for pair in pairs if isinstance(pair, ScenePair)]
-    if readable:
-        _warm_up(task.method, readable[0])
-    meter = CpuMeter()
-    outcomes = [
-        evaluate_pair(task.method, pair, task.key.seed)
-        if isinstance(pair, ScenePair)
-        else _unreadable_outcome(index, pair)
-        for index, pair in zip(task.indices, pairs)
-    ]
-    busy, machine = meter.others_were_busy(), processor_name()
-    return [replace(outcome, busy=busy, machine=machine) for outcome in outcomes]
+    outcomes = []
+    with one_thread():
+        for index in task.indices:
+            pair = _read_pair(task.source, index)
+            if isinstance(pair, ScenePair):
+                outcomes.append(evaluate_pair(task.method, pair, task.key.seed))
+            else:
+                outcomes.append(_unreadable_outcome(index, pair))
+    return outcomes
 
 
 def _unreadable_outcome(index: int, error: DatasetError) -> PairOutcome:
     """A failure in every figure: no pose, nothing found."""
     nothing = (0.0, 0.0, 0.0)
-    return PairOutcome(index, FAILURE_DEG, None, None, nothing, nothing, 0.0, 0.0, f"{UNREADABLE}{error}")
+    return PairOutcome(index, FAILURE_DEG, None, None, nothing, nothing, f"{UNREADABLE}{error}")
 
 
 def answer_pair(method: Method, pair: ScenePair, seed: int) -> Answer:
@@ -200,10 +180,8 @@ def answer_pair(method: Method, pair: ScenePair, seed: int) -> Answer:
 
 
 def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
-    """Run a method on one pair, time it and compare its answer with the truth."""
-    wall, cpu = time.perf_counter(), time.process_time()
+    """Run a method on one pair and compare its answer with the truth."""
     answer = answer_pair(method, pair, seed)
-    elapsed_ms, cpu_ms = 1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - cpu)
     truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
     rotation_deg = translation_deg = None
     error_deg = FAILURE_DEG
@@ -225,8 +203,6 @@ def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
         translation_deg=translation_deg,
         kept=precision_recall_f(answer.kept, truth),
         mask=precision_recall_f(answer.mask, truth),
-        elapsed_ms=elapsed_ms,
-        cpu_ms=cpu_ms,
         failure=failure,
         paper=paper,
         counts=counts,

@@ -50,8 +50,8 @@ class ProductMethod:
 
     @property
     def seeded(self) -> bool:
-        """PoseLib rows are averaged over the same seeds as the rivals'; the others run once, as OpenCV's do."""
-        return self.variant == "product poselib"
+        """The filter's fit draws by a seed, and is averaged over the same ones as the rivals that take a seed."""
+        return self.variant.startswith("product")
 
     def settings(self) -> dict[str, Any]:
         settings = {
@@ -89,9 +89,9 @@ class ProductMethod:
 
     def _options(self, seed: int) -> dict[str, Any]:
         """What differs from the defaults of ``filter_matches``."""
-        if self.variant == "product poselib":
-            return {"method": "poselib", "seed": seed}
-        return {"method": "none"} if self.variant.startswith("network") else {}
+        if self.variant.startswith("network"):
+            return {"method": "none"}
+        return {"method": "poselib", "seed": seed} if self.variant == "product poselib" else {"seed": seed}
 
 
 @dataclass(frozen=True)

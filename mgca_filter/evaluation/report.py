@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+from .environment import BUSY_LOAD
 from .methods import UNREADABLE
 from .summary import ALL_PAIRS, ALL_SCENES, INTERVAL_STATISTICS
 
@@ -27,6 +28,11 @@ def format_report(summary: Mapping[str, Any], style: Style) -> str:
         parts += [_heading("Failures", style) + "\n\n" + _failure_lines(summary)]
         parts += [_heading("How it was measured", style) + "\n\n" + _measurement_lines(summary)]
     return "\n\n".join(parts) + "\n"
+
+
+def timed_pairs(summary: Mapping[str, Any]) -> int:
+    """Number of pairs that the times were taken on; 0 without times."""
+    return max(int(row.get("timed_pairs", 0)) for row in summary["rows"] if row["scene"] == ALL_PAIRS)
 
 
 def _heading(text: str, style: Style) -> str:
@@ -133,17 +139,16 @@ def _measurement_lines(summary: Mapping[str, Any]) -> str:
     lines = [f"- {note}" for note in summary["notes"]]
     lines += [f"- {item['method']}: not installed ({item['reason']})" for item in summary.get("not_installed", [])]
     lines += [
-        "- {method}: {iterations} iterations take {reached_ms:.1f} ms in the median, {like} {target_ms:.1f} ms".format(
-            **row
-        )
+        "- {method}: takes {share:.2f} times as long as {like} in the median".format(**row)
         for row in summary.get("time_matched", [])
     ]
-    busy = summary["timing"]["share_on_busy_machine"]
-    caution = ": do not rely on these times." if busy > 0 else "."
-    lines.append(
-        f"- Timed on {', '.join(summary['timing']['machines'])}; {100 * busy:.0f} % of it while other programs were at "
-        f"work on the machine{caution}"
-    )
+    timing = summary["timing"]
+    if timing:
+        caution = ": do not rely on these times." if timing["others_load"] > BUSY_LOAD else "."
+        lines.append(
+            f"- Timed on {timing['machine']}, {timed_pairs(summary)} pairs; other programs used "
+            f"{timing['others_load']:.2f} processors meanwhile{caution}"
+        )
     for key in ("commit", "seed", "versions", "machine"):
         if key in summary:
             value = summary[key]

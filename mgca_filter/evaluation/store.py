@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -34,9 +34,8 @@ class ResultKey:
     @property
     def file_name(self) -> str:
         """``scene/method.seedN.digest.json``."""
-        digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:16]
         words = re.sub(r"[^a-z0-9.]+", "-", self.method.lower()).strip("-")
-        return f"{self.scene}/{words}.seed{self.seed}.{digest}.json"
+        return f"{self.scene}/{words}.seed{self.seed}.{_digest(asdict(self))}.json"
 
 
 class ResultStore:
@@ -67,8 +66,24 @@ class ResultStore:
         if self.folder is None:
             self._memory[key.file_name] = known
             return
-        path = self.folder / key.file_name
-        path.parent.mkdir(parents=True, exist_ok=True)
         content = {"key": asdict(key), "outcomes": [asdict(known[pair]) for pair in sorted(known)]}
-        with replaced_when_done(path) as temporary:
-            temporary.write_text(json.dumps(content))
+        _write(self.folder / key.file_name, content)
+
+    def once(self, name: str, depends_on: Any, compute: Callable[[], Any]) -> Any:
+        """What ``compute`` gives, kept as ``name.digest.json`` for exactly what it depends on; JSON values both."""
+        if self.folder is None:
+            return compute()
+        path = self.folder / f"{name}.{_digest(depends_on)}.json"
+        if not path.exists():
+            _write(path, {"key": depends_on, "value": compute()})
+        return json.loads(path.read_text())["value"]
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _write(path: Path, content: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replaced_when_done(path) as temporary:
+        temporary.write_text(json.dumps(content))

@@ -15,18 +15,19 @@ from .metrics import (
     POSE_STATISTICS,
     FloatArray,
     SceneErrors,
-    bootstrap_interval,
     mean_of_the_nonzero,
     mean_over_pairs,
     mean_over_scenes,
     median_error,
-    paired_bootstrap_interval,
+    percentile_interval,
+    replicate_means,
 )
 from .predict import SceneOutcomes
+from .timing import Timing
 
 ALL_SCENES, ALL_PAIRS = "all", "pairs"
 INTERVAL_STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
-COUNTS = ("failures", "unreadable", "paper_dropped")
+COUNTS = ("failures", "unreadable", "paper_dropped", "timed_pairs")
 """Numbers of pairs, which the mean over scenes adds up; ``pairs`` itself among them."""
 
 NOTES = (
@@ -35,9 +36,9 @@ NOTES = (
     "against the label 1e-4; mask_P, mask_R, mask_F: the final inliers. Every pair counts.",
     "paper_P, paper_R, paper_F: as published evaluations of the family have them, logit > 2 and pairs whose value is "
     "0 or NaN left out of the mean. Not to be compared with the figures beside them.",
-    "Times: wall clock of filter and estimator with one OpenCV thread; ONNX Runtime uses its own number of threads.",
-    "OpenCV's estimators and the filter's OpenCV fit are deterministic and run once; PoseLib and DEGENSAC are averaged "
-    "over seeds.",
+    "Times: wall clock of tests, network and estimator on one thread, detection and matching not counted; pair by pair "
+    "all rows in turn, so that whatever else the machine does hits them alike.",
+    "OpenCV's estimators fix their own seeds and run once; PoseLib, DEGENSAC and the filter are averaged over seeds.",
     "PROSAC and PoseLib with progressive sampling get their matches sorted: by ratio, or by the network's scores.",
 )
 
@@ -52,6 +53,7 @@ def scene_errors(outcomes: SceneOutcomes) -> dict[str, FloatArray]:
 def summarize(
     results: Mapping[str, SceneOutcomes],
     context: Mapping[str, Any],
+    timing: Timing | None = None,
     *,
     reference: str | None = None,
     replicates: int = 1000,
@@ -62,6 +64,7 @@ def summarize(
     Args:
         results: outcomes by method, as :func:`predict.predict` returns them.
         context: written beside the rows as it is: versions, seed, commit, machine, settings.
+        timing: times of the same methods, as :func:`timing.time_methods` returns them; without, rows hold none.
         reference: method whose differences from every other are listed; None = the first product row, else the last.
         replicates: of the bootstrap; 0 leaves the intervals and differences out.
         seed: of the bootstrap.
@@ -72,13 +75,19 @@ def summarize(
         ``curves``, ``timing`` and ``notes``, and the context's own fields.
     """
     errors = {name: scene_errors(outcomes) for name, outcomes in results.items()}
-    rows = [row for name, outcomes in results.items() for row in _method_rows(name, outcomes, errors[name])]
+    times = {} if timing is None else timing.milliseconds
+    rows = [
+        row
+        for name, outcomes in results.items()
+        for row in _method_rows(name, outcomes, errors[name], times.get(name, {}))
+    ]
     differences: list[dict[str, Any]] = []
     if replicates > 0:
+        means = {name: _replicates(scenes, replicates, seed) for name, scenes in errors.items()}
         for row in rows:
             if row["scene"] == ALL_SCENES:
-                row["intervals"] = _intervals(errors[row["method"]], replicates, seed)
-        differences = _differences(errors, choose_reference(list(results), reference), replicates, seed)
+                row["intervals"] = {key: percentile_interval(values) for key, values in means[row["method"]].items()}
+        differences = _differences(errors, means, choose_reference(list(results), reference))
     return {
         "rows": rows,
         "differences": differences,
@@ -89,24 +98,35 @@ def summarize(
             "precision_recall": precision_recall_curves(results),
             "reliability": reliability_tables(results),
         },
-        "timing": _timing(results),
+        "timing": None if timing is None else {"machine": timing.machine, "others_load": timing.others_load},
         "notes": list(NOTES),
         **context,
     }
 
 
-def _method_rows(name: str, outcomes: SceneOutcomes, errors: SceneErrors) -> list[dict[str, Any]]:
+def _method_rows(
+    name: str, outcomes: SceneOutcomes, errors: SceneErrors, times: Mapping[str, list[float]]
+) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for scene, runs in outcomes.items():
-        figures = {key: 100.0 * statistic(errors[scene]) for key, statistic in POSE_STATISTICS.items()}
-        figures["median_error_deg"] = median_error(errors[scene])
+        figures = {key: 100.0 * float(statistic(errors[scene])) for key, statistic in POSE_STATISTICS.items()}
+        figures["median_error_deg"] = float(median_error(errors[scene]))
         rows.append(
-            {"method": name, "scene": scene, "pairs": len(runs[0]), **figures, **_decisions(runs), **_times(runs)}
+            {
+                "method": name,
+                "scene": scene,
+                "pairs": len(runs[0]),
+                **figures,
+                **_decisions(runs),
+                **_times(times.get(scene, [])),
+            }
         )
     pairs = sum(row["pairs"] for row in rows)
-    numbers = [key for key in rows[0] if key not in ("method", "scene", "pairs", *COUNTS)]
-    mean = {key: float(np.mean([row[key] for row in rows])) for key in numbers}
-    sums = {key: sum(row[key] for row in rows) for key in COUNTS if key in rows[0]}
+    # The papers' variant and times are lacking where not one pair of a scene could be read.
+    keys = dict.fromkeys(key for row in rows for key in row if key not in ("method", "scene", "pairs"))
+    columns = {key: [row[key] for row in rows if key in row] for key in keys}
+    mean = {key: float(np.mean(values)) for key, values in columns.items() if key not in COUNTS}
+    sums = {key: sum(columns[key]) for key in COUNTS if key in columns}
     headline = {"method": name, "scene": ALL_SCENES, "pairs": pairs, **mean, **sums}
     pooled_runs = [[outcome for runs in outcomes.values() for outcome in runs[s]] for s in range(_seeds(outcomes))]
     pooled = {key: 100.0 * mean_over_pairs(statistic, errors) for key, statistic in POSE_STATISTICS.items()}
@@ -117,7 +137,7 @@ def _method_rows(name: str, outcomes: SceneOutcomes, errors: SceneErrors) -> lis
         "pairs": pairs,
         **pooled,
         **_decisions(pooled_runs),
-        **_times(pooled_runs),
+        **_times([value for scene in times.values() for value in scene]),
     }
     return [*rows, headline, pooled_row]
 
@@ -145,23 +165,20 @@ def _decisions(runs: list[list[PairOutcome]]) -> dict[str, float]:
     return figures
 
 
-def _times(runs: list[list[PairOutcome]]) -> dict[str, float]:
-    """Medians and 95th percentile of the times of all pairs that could be read; 0 without any."""
-    timed = [outcome for run in runs for outcome in run if not outcome.unreadable]
-    wall, cpu = ([getattr(outcome, field) for outcome in timed] or [0.0] for field in ("elapsed_ms", "cpu_ms"))
+def _times(milliseconds: Sequence[float]) -> dict[str, float]:
+    """Median and 95th percentile, and on how many pairs; nothing without any."""
+    if not milliseconds:
+        return {}
+    median, p95 = np.percentile(milliseconds, [50, 95])
+    return {"median_ms": float(median), "p95_ms": float(p95), "timed_pairs": len(milliseconds)}
+
+
+def _replicates(errors: SceneErrors, replicates: int, seed: int) -> dict[str, FloatArray]:
+    """Headlines (replicates,) in per cent on resampled pairs, the same for all methods, so that they can be paired."""
     return {
-        "median_ms": float(np.median(wall)),
-        "p95_ms": float(np.percentile(wall, 95)),
-        "median_cpu_ms": float(np.median(cpu)),
+        key: 100.0 * replicate_means(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
+        for key in INTERVAL_STATISTICS
     }
-
-
-def _intervals(errors: SceneErrors, replicates: int, seed: int) -> dict[str, list[float]]:
-    intervals = {}
-    for key in INTERVAL_STATISTICS:
-        bounds = bootstrap_interval(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
-        intervals[key] = [100.0 * bound for bound in bounds]
-    return intervals
 
 
 def choose_reference(names: Sequence[str], reference: str | None) -> str:
@@ -177,7 +194,9 @@ def choose_reference(names: Sequence[str], reference: str | None) -> str:
     return next((name for name in names if name.endswith("product")), names[-1])
 
 
-def _differences(errors: Mapping[str, SceneErrors], reference: str, replicates: int, seed: int) -> list[dict[str, Any]]:
+def _differences(
+    errors: Mapping[str, SceneErrors], means: Mapping[str, Mapping[str, FloatArray]], reference: str
+) -> list[dict[str, Any]]:
     """Reference minus each other method, mean over scenes, per cent points, with 95 % paired bootstrap intervals."""
     differences = []
     for name in errors:
@@ -187,10 +206,7 @@ def _differences(errors: Mapping[str, SceneErrors], reference: str, replicates: 
         for key in INTERVAL_STATISTICS:
             statistic = POSE_STATISTICS[key]
             value = mean_over_scenes(statistic, errors[reference]) - mean_over_scenes(statistic, errors[name])
-            bounds = paired_bootstrap_interval(
-                errors[reference], errors[name], statistic, replicates=replicates, seed=seed
-            )
-            entry[key] = [100.0 * number for number in (value, *bounds)]
+            entry[key] = [100.0 * value, *percentile_interval(means[reference][key] - means[name][key])]
         differences.append(entry)
     return differences
 
@@ -211,9 +227,3 @@ def _unreadable(results: Mapping[str, SceneOutcomes]) -> list[dict[str, Any]]:
         if outcome.unreadable
     }
     return [{"scene": scene, "pair": pair, "reason": reason} for (scene, pair), reason in found.items()]
-
-
-def _timing(results: Mapping[str, SceneOutcomes]) -> dict[str, Any]:
-    outcomes = [o for by_scene in results.values() for runs in by_scene.values() for run in runs for o in run]
-    busy = sum(outcome.busy for outcome in outcomes) / len(outcomes)
-    return {"machines": sorted({outcome.machine for outcome in outcomes}), "share_on_busy_machine": busy}

@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
-import cv2
 import numpy as np
 
 from ..scene_bundle import ScenePair
 from .environment import processor_name
 from .methods import Method
-from .predict import evaluate_pair
 from .registry import parse_method
+from .store import ResultStore
+from .timing import interleaved_ms
 
-SAMPLE_PAIRS = 60
 MIN_ITERATIONS, MAX_ITERATIONS = 50, 1 << 20
 BISECTIONS = 2
 TIE = 0.05  # of the target: times closer to each other than this are the same to a noisy clock
@@ -32,85 +28,69 @@ class TimeMatch:
 
     Attributes:
         method: name of the row, iterations included. iterations: the most that it may spend.
-        reached_ms: its median time on the sample. like, target_ms: the row it was matched to, and that one's time.
+        like: the row whose time it gets. share: its median time over that one's, both taken in turn.
     """
 
     method: str
     iterations: int
-    reached_ms: float
     like: str
-    target_ms: float
+    share: float
 
 
-def match_times(
-    names: Sequence[str], like: Method, pairs: Sequence[ScenePair], folder: Path | None = None
-) -> list[TimeMatch]:
+def match_times(names: Sequence[str], like: Method, pairs: Sequence[ScenePair], store: ResultStore) -> list[TimeMatch]:
     """Iterations with which each rival takes as long as ``like`` in the median over the same pairs.
 
     Confidence is 1 − 1e-9, so that few stop early; where an estimator does, or one iteration costs more than all of
-    ours, the time that comes closest is taken, and ``reached_ms`` says so.
+    ours, the time that comes closest is taken, and ``share`` says so.
 
     Args:
         names: rivals, without a number of iterations.
         like: the row whose time they get.
-        pairs: at least one; times are measured here, in turn, on one thread.
-        folder: where the answer is kept, so that a second run uses the same rows.
+        pairs: both are timed on them in turn, on one thread.
+        store: where the answer is kept, so that a second run uses the same rows.
+
+    Raises:
+        ValueError: there is no pair.
     """
-    path = None if folder is None else folder / f"time-matched.{_digest(names, like, pairs)}.json"
-    if path is not None and path.exists():
-        return [TimeMatch(**fields) for fields in json.loads(path.read_text())]
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        target_ms = _median_ms(like, pairs)
-        matches = [_search(name, like.name, target_ms, pairs) for name in names]
-    finally:
-        cv2.setNumThreads(threads)
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps([asdict(match) for match in matches], indent=1))
-    return matches
+    if not pairs:
+        raise ValueError("times cannot be matched: not one pair can be read")
+    where = {"pairs": [pair.name for pair in pairs], "machine": processor_name()}
+    depends_on = {"rows": list(names), "like": like.name, "settings": like.settings(), **where}
+    matches = store.once("time-matched", depends_on, lambda: [asdict(_search(name, like, pairs)) for name in names])
+    return [TimeMatch(**fields) for fields in matches]
 
 
-def _digest(names: Sequence[str], like: Method, pairs: Sequence[ScenePair]) -> str:
-    content = [list(names), like.name, like.settings(), [pair.name for pair in pairs], processor_name()]
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def _search(name: str, like: str, target_ms: float, pairs: Sequence[ScenePair]) -> TimeMatch:
+def _search(name: str, like: Method, pairs: Sequence[ScenePair]) -> TimeMatch:
     """Doubles or halves the iterations past the target, then divides the bracket in the logarithm."""
 
-    def measure(iterations: int) -> float:
-        return _median_ms(parse_method(f"{name} {iterations} iterations"), pairs)
+    def share(iterations: int) -> float:
+        rival = parse_method(f"{name} {iterations} iterations")
+        ours, theirs = np.median(interleaved_ms([like, rival], pairs), axis=1)
+        return float(theirs / ours)
 
-    tried = {1000: measure(1000)}
-    factor = 2.0 if tried[1000] < target_ms else 0.5
+    tried = {1000: share(1000)}
+    factor = 2.0 if tried[1000] < 1.0 else 0.5
     iterations = 1000
-    while (tried[iterations] < target_ms) == (factor > 1):
+    while (tried[iterations] < 1.0) == (factor > 1):
         following = int(np.clip(iterations * factor, MIN_ITERATIONS, MAX_ITERATIONS))
         if following == iterations:
             break
-        tried[following] = measure(following)
+        tried[following] = share(following)
         stalled = factor > 1 and tried[following] < STALLED * tried[iterations]
         iterations = following
         if stalled and iterations >= STALL_ITERATIONS:
             break
     for _ in range(BISECTIONS):
-        below = [n for n in tried if tried[n] < target_ms]
-        above = [n for n in tried if tried[n] >= target_ms]
+        below = [n for n in tried if tried[n] < 1.0]
+        above = [n for n in tried if tried[n] >= 1.0]
         if below and above:
             middle = round(float(np.sqrt(max(below) * min(above))))
-            tried[middle] = measure(middle)
+            tried[middle] = share(middle)
 
     def distance(iterations: int) -> tuple[float, int]:
         # Of times a few per cent apart, the most iterations that keep below ours, the fewest of those that do not.
-        apart = (tried[iterations] - target_ms) / target_ms
+        apart = tried[iterations] - 1.0
         return round(abs(apart) / TIE) * TIE, -iterations if apart <= 0 else iterations
 
     best = min(tried, key=distance)
-    return TimeMatch(f"{name} {best} iterations", best, tried[best], like, target_ms)
-
-
-def _median_ms(method: Method, pairs: Sequence[ScenePair]) -> float:
-    evaluate_pair(method, pairs[0], 0)  # not timed: sessions are opened, buffers allocated
-    return float(np.median([evaluate_pair(method, pair, 0).elapsed_ms for pair in pairs]))
+    return TimeMatch(f"{name} {best} iterations", best, like.name, tried[best])

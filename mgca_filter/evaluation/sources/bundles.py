@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ...errors import BundleError
 from ...scene_bundle import SceneBundle, ScenePair
-from .base import Image, digest_files, read_image
+from .base import Image, check_pose, digest_files, read_image
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,9 @@ class BundleSource:
         return self.count
 
     def __getitem__(self, index: int) -> ScenePair:
-        return _bundle(self.path, self.sha256)[index]
+        pair = _bundle(self.path, self.sha256)[index]
+        check_pose(pair.R, pair.t, f"{self.path}: pair {index}")
+        return pair
 
     def images(self, pair: ScenePair) -> tuple[Image, Image] | None:
         """The photographs of the folder, or of its subfolder named like the scene, where both have the right size.

@@ -15,7 +15,7 @@ from ...correspondences import MatchAttributes
 from ...keypoints import create_detector, detect_keypoints
 from ...matching import match_descriptors, read_matches
 from ...scene_bundle import ScenePair
-from .base import read_image
+from .base import Image, read_image
 
 FEATURE_SETTINGS = f"sift 2000, revision 1, opencv {cv2.__version__}"
 """Part of the digest of whatever is detected and matched here."""
@@ -73,8 +73,12 @@ def detect(path: Path, quarter_turns: int = 0) -> ImageFeatures:
     Raises:
         DatasetError: the image is missing or cannot be read.
     """
-    image = np.ascontiguousarray(np.rot90(read_image(path), quarter_turns))
-    keypoints, descriptors = detect_keypoints(image, create_detector(), str(path))
+    return describe(np.ascontiguousarray(np.rot90(read_image(path), quarter_turns)), create_detector(), str(path))
+
+
+def describe(image: Image, detector: cv2.Feature2D, name: str) -> ImageFeatures:
+    """Features of an image (H, W) or (H, W, 3) uint8; ``name`` stands in messages."""
+    keypoints, descriptors = detect_keypoints(image, detector, name)
     values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64).reshape(-1, 4)
     return ImageFeatures(
         size=(image.shape[1], image.shape[0]),

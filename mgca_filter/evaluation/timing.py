@@ -1,0 +1,68 @@
+"""What each row costs: all of them on the same pairs, one after the other, on one thread of one process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..scene_bundle import ScenePair
+from .environment import CpuMeter, one_thread, processor_name
+from .methods import Method
+from .metrics import FloatArray
+from .predict import answer_pair
+from .store import ResultStore
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Times of one run.
+
+    Attributes:
+        milliseconds: wall clock of each timed pair, by method and scene.
+        machine: the processor's name.
+        others_load: number of processors that other programs used meanwhile, on average.
+    """
+
+    milliseconds: dict[str, dict[str, list[float]]]
+    machine: str
+    others_load: float
+
+
+def time_methods(methods: Sequence[Method], pairs: Sequence[ScenePair], store: ResultStore) -> Timing:
+    """Times of every method on every pair, at seed 0; taken once for the same methods, pairs and processor.
+
+    Whatever else the machine does hits all methods alike, so that their times can be compared with each other.
+    """
+
+    def measure() -> dict[str, Any]:
+        meter = CpuMeter()
+        times = interleaved_ms(methods, pairs)
+        scenes = list(dict.fromkeys(pair.scene for pair in pairs))
+        rows = {scene: [i for i, pair in enumerate(pairs) if pair.scene == scene] for scene in scenes}
+        milliseconds = {
+            method.name: {scene: [float(times[m, i]) for i in rows[scene]] for scene in scenes}
+            for m, method in enumerate(methods)
+        }
+        return asdict(Timing(milliseconds, processor_name(), meter.others_load()))
+
+    settings = {method.name: method.settings() for method in methods}
+    depends_on = {"methods": settings, "pairs": [pair.name for pair in pairs], "machine": processor_name()}
+    return Timing(**store.once("times", depends_on, measure))
+
+
+def interleaved_ms(methods: Sequence[Method], pairs: Sequence[ScenePair]) -> FloatArray:
+    """Wall clock (methods, pairs): pair by pair all methods in turn, each pair beginning with another one."""
+    times = np.zeros((len(methods), len(pairs)))
+    with one_thread():
+        for method in methods if pairs else ():
+            answer_pair(method, pairs[0], 0)  # not timed: sessions are opened, buffers allocated
+        for i, pair in enumerate(pairs):
+            for m in ((i + k) % len(methods) for k in range(len(methods))):
+                started = time.perf_counter()
+                answer_pair(methods[m], pair, 0)
+                times[m, i] = 1e3 * (time.perf_counter() - started)
+    return times
