@@ -40,7 +40,7 @@ def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
             never_worse.main,
             [bundles, str(options.rendered), "--per-scene", "40", "--store", store],
         ),
-        "focal": (focal_error.main, [bundles, "--per-scene", "20"]),
+        "focal": (focal_error.main, [bundles, "--per-scene", "40"]),
         "detectors": (detectors.main, [*scenes, "--rendered", photos]),
     }
 
