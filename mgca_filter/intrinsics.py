@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .correspondences import normalize_points
+from .epipolar import homogeneous
 
 GUESSED_FOCAL_FACTOR = 1.2
+# A coordinate beyond this comes from broken input and says nothing of the size of an image.
+_LARGEST_PX = 1e6
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
+# The five steps that OpenCV takes unasked leave errors of a pixel in the corners of a wide lens.
+_UNDISTORT_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
+_UNDISTORTED_WITHIN_PX = 0.1
 
 
 @dataclass(frozen=True)
@@ -38,8 +44,7 @@ class Intrinsics:
         if self.distortion is None:
             normalized[finite] = normalize_points(points[finite], self.K)
         elif finite.any():
-            undistorted = cv2.undistortPoints(np.ascontiguousarray(points[finite])[:, None], self.K, self.distortion)
-            normalized[finite] = undistorted[:, 0]
+            normalized[finite] = _undistort(points[finite], self.K, self.distortion)
         return normalized
 
     def project(self, normalized: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,11 +91,27 @@ def resolve_intrinsics(
     return first, Intrinsics(_read_K(K2, "K2"), _read_distortion(dist2, "dist2"), guessed=False)
 
 
+def _undistort(
+    points: NDArray[np.float64], K: NDArray[np.float64], coefficients: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Pixels (N, 2) to the normalised plane (N, 2); NaN where no point of the plane is distorted to the pixel."""
+    arguments = (np.ascontiguousarray(points)[:, None], K, coefficients)
+    until_converged = getattr(cv2, "undistortPointsIter", None)  # OpenCV 4
+    if until_converged is not None:
+        normalized = until_converged(*arguments, None, None, _UNDISTORT_STEPS)
+    else:
+        normalized = cv2.undistortPoints(*arguments, criteria=_UNDISTORT_STEPS)
+    nowhere = np.zeros(3)
+    distorted, _ = cv2.projectPoints(homogeneous(normalized[:, 0]), nowhere, nowhere, K, coefficients)
+    reached = np.linalg.norm(distorted[:, 0] - points, axis=1) < _UNDISTORTED_WITHIN_PX
+    return np.where(reached[:, None], normalized[:, 0], np.nan)
+
+
 def _guess(points: NDArray[np.float64], size: tuple[float, float] | None, image: int) -> Intrinsics:
     source = "the image size"
     if size is None:
-        finite = points[np.isfinite(points).all(axis=1)]
-        width, height = (np.max(finite, axis=0) + 1.0) if len(finite) else (1.0, 1.0)
+        usable = points[(np.abs(points) < _LARGEST_PX).all(axis=1)]
+        width, height = (np.max(usable, axis=0) + 1.0) if len(usable) else (1.0, 1.0)
         size = (max(float(width), 1.0), max(float(height), 1.0))
         source = "the extent of the keypoints"
     focal = GUESSED_FOCAL_FACTOR * max(size)
