@@ -1,6 +1,6 @@
 """Draws the README's picture: RANSAC alone above, mgca_filter below, on the same raw matches of the example pair.
 
-    python examples/before_after.py [--out docs/before_after.jpg]
+``python examples/before_after.py [--out docs/before_after.jpg]``
 """
 
 from __future__ import annotations

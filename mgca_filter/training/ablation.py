@@ -122,7 +122,9 @@ def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespac
     """The command line."""
     names = [row.name for row in ROWS]
     parser = argparse.ArgumentParser(prog="python -m mgca_filter.training.ablation", description="Run the ablation.")
-    parser.add_argument("--config", type=Path, default=CONFIGS / "ablation.toml", help="the full network and its schedule")
+    parser.add_argument(
+        "--config", type=Path, default=CONFIGS / "ablation.toml", help="the full network and its schedule"
+    )
     parser.add_argument("--data", type=Path, required=True, help="as for training")
     parser.add_argument("--steps", type=int, required=True, help="budget of every row")
     parser.add_argument("--out", type=Path, required=True, help="folder for runs and table; what is done is kept")
