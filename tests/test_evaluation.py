@@ -463,6 +463,17 @@ def test_summary_rows_by_scene_over_scenes_and_over_pairs():
     (difference,) = summary["differences"]
     assert (difference["method"], difference["minus"]) == ("product", "rival")
     assert difference["mAP@5"][0] == pytest.approx(-25.0)
+    # hall has one pair right of two, yard's only pair is wrong
+    assert rows["product", "hall"]["intervals"]["mAP@5"] == (0.0, 100.0)
+    assert rows["product", "yard"]["intervals"]["mAP@5"] == (0.0, 0.0)
+    assert rows["product", "all"]["intervals"]["mAP@5"] == (0.0, 50.0)
+    assert "intervals" not in rows["product", "pairs"]
+
+
+def test_a_single_row_has_its_interval():
+    results = {"product": small_results()["product"]}
+    assert "intervals of the headline" in format_report(summarize(results, {}, replicates=10), "text")
+    assert "intervals" not in format_report(summarize(results, {}, replicates=0), "text")
 
 
 def test_reference_of_the_differences_can_be_chosen():

@@ -140,7 +140,8 @@ def bootstrap_interval(
     Pairs are drawn with replacement within their scene: the interval speaks of the chance in the choice of pairs, the
     scenes being what they are. All runs (seeds) of a drawn pair come along.
     """
-    return percentile_interval(replicate_means(errors, statistic, replicates=replicates, seed=seed), level)
+    resampled = resampled_figures(errors, statistic, replicates=replicates, seed=seed)
+    return percentile_interval(resampled.mean(axis=0), level)
 
 
 def paired_bootstrap_interval(
@@ -164,25 +165,25 @@ def paired_bootstrap_interval(
     for scene in errors:
         if np.atleast_2d(errors[scene]).shape[1] != np.atleast_2d(baseline[scene]).shape[1]:
             raise ValueError(f"scene {scene}: the two methods were run on different numbers of pairs")
-    ours, theirs = (replicate_means(e, statistic, replicates=replicates, seed=seed) for e in (errors, baseline))
-    return percentile_interval(ours - theirs, level)
+    ours, theirs = (resampled_figures(e, statistic, replicates=replicates, seed=seed) for e in (errors, baseline))
+    return percentile_interval((ours - theirs).mean(axis=0), level)
 
 
-def replicate_means(errors: SceneErrors, statistic: Statistic, *, replicates: int, seed: int) -> FloatArray:
-    """Means over scenes (replicates,) on resampled pairs.
+def resampled_figures(errors: SceneErrors, statistic: Statistic, *, replicates: int, seed: int) -> FloatArray:
+    """The scenes' figures (scenes, replicates) on pairs drawn with replacement within their scene.
 
-    Methods that were run on the same pairs see the same resamples under the same seed.
+    Methods that were run on the same pairs see the same draws under the same seed.
     """
     generator = np.random.default_rng(seed)
-    means = np.zeros(replicates)
-    for scene_errors in errors.values():
+    figures = np.zeros((len(errors), replicates))
+    for scene, scene_errors in enumerate(errors.values()):
         runs = np.atleast_2d(scene_errors)
         count = runs.shape[1]
         for first in range(0, replicates, _REPLICATES_AT_ONCE):
-            block = slice(first, min(first + _REPLICATES_AT_ONCE, replicates))
-            rows = generator.integers(0, count, size=(block.stop - first, count))
-            means[block] += statistic(np.moveaxis(runs[:, rows], 0, 1))  # (replicates, S, P)
-    return means / len(errors)
+            last = min(first + _REPLICATES_AT_ONCE, replicates)
+            rows = generator.integers(0, count, size=(last - first, count))
+            figures[scene, first:last] = statistic(np.moveaxis(runs[:, rows], 0, 1))  # (replicates, S, P)
+    return figures
 
 
 def percentile_interval(values: FloatArray, level: float = 0.95) -> tuple[float, float]:

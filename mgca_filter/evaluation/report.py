@@ -21,8 +21,10 @@ def format_report(summary: Mapping[str, Any], style: Style) -> str:
     LaTeX holds the tables alone, for ``booktabs``.
     """
     tables = [*_mean_tables(summary), ("mAP@20 by scene", *_scene_table(summary["rows"])), _decision_table(summary)]
+    if any("intervals" in row for row in summary["rows"]):
+        tables.append(_interval_table(summary["rows"]))
     if summary["differences"]:
-        tables += [_interval_table(summary["rows"]), _difference_table(summary["differences"])]
+        tables.append(_difference_table(summary["differences"]))
     parts = [render_table(title, header, body, style) for title, header, body in tables]
     if style != "latex":
         parts += [_heading("Failures", style) + "\n\n" + _failure_lines(summary)]
@@ -108,7 +110,7 @@ def _interval_table(rows: Sequence[Mapping[str, Any]]) -> tuple[str, list[str], 
     body = [
         [row["method"], *("{:.1f} … {:.1f}".format(*row["intervals"][key]) for key in INTERVAL_STATISTICS)]
         for row in rows
-        if "intervals" in row
+        if row["scene"] == ALL_SCENES
     ]
     return "95 % bootstrap intervals of the headline", ["method", *INTERVAL_STATISTICS], body
 

@@ -20,7 +20,7 @@ from .metrics import (
     mean_over_scenes,
     median_error,
     percentile_interval,
-    replicate_means,
+    resampled_figures,
 )
 from .predict import SceneOutcomes
 from .timing import Timing
@@ -83,11 +83,12 @@ def summarize(
     ]
     differences: list[dict[str, Any]] = []
     if replicates > 0:
-        means = {name: _replicates(scenes, replicates, seed) for name, scenes in errors.items()}
+        resampled = {name: _resampled(scenes, replicates, seed) for name, scenes in errors.items()}
         for row in rows:
-            if row["scene"] == ALL_SCENES:
-                row["intervals"] = {key: percentile_interval(values) for key, values in means[row["method"]].items()}
-        differences = _differences(errors, means, choose_reference(list(results), reference))
+            if row["scene"] in resampled[row["method"]]:
+                figures = resampled[row["method"]][row["scene"]]
+                row["intervals"] = {key: percentile_interval(values) for key, values in figures.items()}
+        differences = _differences(errors, resampled, choose_reference(list(results), reference))
     return {
         "rows": rows,
         "differences": differences,
@@ -173,12 +174,18 @@ def _times(milliseconds: Sequence[float]) -> dict[str, float]:
     return {"median_ms": float(median), "p95_ms": float(p95), "timed_pairs": len(milliseconds)}
 
 
-def _replicates(errors: SceneErrors, replicates: int, seed: int) -> dict[str, FloatArray]:
-    """Headlines (replicates,) in per cent on resampled pairs, the same for all methods, so that they can be paired."""
-    return {
-        key: 100.0 * replicate_means(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
-        for key in INTERVAL_STATISTICS
-    }
+def _resampled(errors: SceneErrors, replicates: int, seed: int) -> dict[str, dict[str, FloatArray]]:
+    """By scene, and for the mean over scenes, figures (replicates,) in per cent on resampled pairs.
+
+    The draws are the same for all methods, so that they can be paired.
+    """
+    figures: dict[str, dict[str, FloatArray]] = {scene: {} for scene in (*errors, ALL_SCENES)}
+    for key in INTERVAL_STATISTICS:
+        values = 100.0 * resampled_figures(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
+        for scene, scene_values in zip(errors, values):
+            figures[scene][key] = scene_values
+        figures[ALL_SCENES][key] = values.mean(axis=0)
+    return figures
 
 
 def choose_reference(names: Sequence[str], reference: str | None) -> str:
@@ -195,7 +202,7 @@ def choose_reference(names: Sequence[str], reference: str | None) -> str:
 
 
 def _differences(
-    errors: Mapping[str, SceneErrors], means: Mapping[str, Mapping[str, FloatArray]], reference: str
+    errors: Mapping[str, SceneErrors], resampled: Mapping[str, Mapping[str, Mapping[str, FloatArray]]], reference: str
 ) -> list[dict[str, Any]]:
     """Reference minus each other method, mean over scenes, per cent points, with 95 % paired bootstrap intervals."""
     differences = []
@@ -206,7 +213,8 @@ def _differences(
         for key in INTERVAL_STATISTICS:
             statistic = POSE_STATISTICS[key]
             value = mean_over_scenes(statistic, errors[reference]) - mean_over_scenes(statistic, errors[name])
-            entry[key] = [100.0 * value, *percentile_interval(means[reference][key] - means[name][key])]
+            apart = resampled[reference][ALL_SCENES][key] - resampled[name][ALL_SCENES][key]
+            entry[key] = [100.0 * value, *percentile_interval(apart)]
         differences.append(entry)
     return differences
 
