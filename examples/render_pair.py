@@ -217,7 +217,10 @@ def main() -> None:
     pose = {"K1": camera1.K, "K2": camera2.K, "R": R, "t": camera2.t - R @ camera1.t}
     pair = {"image1": "left.jpg", "image2": "right.jpg", **{name: value.tolist() for name, value in pose.items()}}
     (options.out / "pair.json").write_text(json.dumps(pair, indent=1) + "\n")
-    print(f"wrote left.jpg, right.jpg and pair.json to {options.out}")
+    T = np.vstack([np.column_stack([pose["R"], pose["t"]]), [0.0, 0.0, 0.0, 1.0]])
+    numbers = np.concatenate([matrix.ravel() for matrix in (pose["K1"], pose["K2"], T)]).tolist()
+    (options.out / "courtyard.txt").write_text(f"left.jpg right.jpg 0 0 {' '.join(map(str, numbers))}\n")
+    print(f"wrote left.jpg, right.jpg, pair.json and courtyard.txt to {options.out}")
 
 
 if __name__ == "__main__":

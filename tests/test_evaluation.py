@@ -115,6 +115,10 @@ def test_bundles_that_cannot_be_used_are_named(folder, tmp_path):
         select_pairs(tmp_path)
     with pytest.raises(ValueError, match="per_scene"):
         select_pairs(folder, per_scene=0)
+    for name in ("all", "pairs"):
+        with pytest.raises(DatasetError, match=f"a scene cannot be called '{name}'"):
+            select_pairs(write_bundle(tmp_path / f"{name}.npz", [make_scene()]))
+        (tmp_path / f"{name}.npz").unlink()
     write_bundle(tmp_path / "good.npz", [make_scene()])
     (tmp_path / "torn.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:3000])
     with pytest.raises(BundleError, match=r"torn\.npz"):

@@ -14,7 +14,7 @@ from scene_bundles import write_bundle
 
 from mgca_filter.evaluation.__main__ import main
 from mgca_filter.evaluation.curves import precision_recall_curves, recall_curves, reliability_tables
-from mgca_filter.evaluation.figures import draw_figures, is_ours
+from mgca_filter.evaluation.figures import draw_figures
 from mgca_filter.evaluation.methods import UNREADABLE, PairOutcome
 from mgca_filter.evaluation.pairs import sample_pairs, select_pairs
 from mgca_filter.evaluation.paper import format_paper, load_paper
@@ -25,7 +25,7 @@ from mgca_filter.evaluation.registry import PRODUCT_ROWS, RIVAL_ROWS, parse_meth
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.score_counts import LOGIT_EDGES, count_scores, precision_recall_curve, reliability
 from mgca_filter.evaluation.store import ResultKey, ResultStore
-from mgca_filter.evaluation.summary import summarize
+from mgca_filter.evaluation.summary import best_rival, is_ours, summarize
 from mgca_filter.evaluation.timing import Timing
 
 LOGITS = np.array([-11.0, -1.0, 0.0, 1.0, 2.0, 3.0])
@@ -201,6 +201,14 @@ def test_figures_need_what_they_show(tmp_path: Path):
 def test_our_rows_are_known_by_name():
     assert all(is_ours(name) for name in PRODUCT_ROWS)
     assert not any(is_ours(name) for name in RIVAL_ROWS)
+
+
+def test_the_best_rival_is_pictured_beside_the_reference():
+    summary = small_summary()
+    assert best_rival(summary, "product") == "rival"
+    assert best_rival(summary, "rival") == "product"  # ours where there is nothing else
+    summary["rows"] = [row for row in summary["rows"] if row["method"] == "product"]
+    assert best_rival(summary, "product") == "product"
 
 
 def test_pictures_of_pairs_show_right_and_wrong(tmp_path: Path):

@@ -48,6 +48,9 @@ def test_render_pair_gives_the_committed_images_again(tmp_path, pair):
     again = json.loads((tmp_path / "pair.json").read_text())
     for name in ("K1", "K2", "R", "t"):
         np.testing.assert_allclose(again[name], pair[name], atol=1e-12)
+    lists = [(folder / "courtyard.txt").read_text().split() for folder in (tmp_path, EXAMPLES / "images")]
+    assert lists[0][:4] == lists[1][:4]
+    np.testing.assert_allclose(*(np.array(words[4:], dtype=float) for words in lists), atol=1e-12)
     for name in ("left.jpg", "right.jpg"):
         rendered, committed = (cv2.imread(str(folder / name)) for folder in (tmp_path, EXAMPLES / "images"))
         assert np.abs(rendered.astype(float) - committed).mean() < 1.0  # JPEG codecs differ a little

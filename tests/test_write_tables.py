@@ -17,8 +17,15 @@ SUMMARY = {
     ],
     "versions": {"opencv-contrib-python-headless": "5.0.0"},
     "machine": {"processor": "Abacus"},
+    "time_matched": [],
     "timing": {"machine": "Abacus", "others_load": 0.0},
 }
+
+
+def test_rows_of_equal_time_are_explained():
+    script = load_export_module("write_tables")
+    assert "as much time as the filter" not in script.section(SUMMARY)
+    assert "as much time as the filter" in script.section({**SUMMARY, "time_matched": [{"method": "x"}]})
 
 
 def test_tables_and_figures_are_written(tmp_path: Path):
@@ -39,6 +46,7 @@ def test_tables_and_figures_are_written(tmp_path: Path):
         assert "median over 2 pairs" in text
         assert "times are rough" not in text
     assert (tmp_path / script.FIGURES / "time_accuracy.svg").exists()
+    assert (tmp_path / script.FIGURES / "courtyard_0.jpg").exists()
     (tmp_path / "README.md").write_text("no markers")
     with pytest.raises(SystemExit, match=r"README\.md: no scoreboard markers"):
         script.main([str(tmp_path / "board.json"), "--root", str(tmp_path)])

@@ -14,7 +14,7 @@ from typing import Any
 
 from ..errors import MgcaFilterError
 from .environment import library_versions, machine_description, one_thread, source_commit
-from .figures import draw_figures, is_ours
+from .figures import draw_figures
 from .methods import Method
 from .pairs import SceneSelection, sample_pairs, select_pairs
 from .predict import predict
@@ -23,7 +23,7 @@ from .registry import GRID_ROWS, PRODUCT_ROWS, RIVAL_ROWS, TIME_MATCHED_ROWS, pa
 from .report import format_report
 from .sources import FORMATS
 from .store import ResultStore
-from .summary import ALL_SCENES, choose_reference, summarize
+from .summary import best_rival, choose_reference, summarize
 from .time_matching import TimeMatch, match_times
 from .timing import time_methods
 
@@ -163,7 +163,10 @@ def run(options: argparse.Namespace) -> None:
     _write(options, summary)
     if options.figures:
         draw_figures(summary, options.figures)
-        draw_pairs(_pictured(summary, methods, options.reference), selections, options.figures, options.pictures)
+        reference = choose_reference([method.name for method in methods], options.reference)
+        shown = dict.fromkeys([best_rival(summary, reference), reference])
+        pictured = [method for name in shown for method in methods if method.name == name]
+        draw_pairs(pictured, selections, options.figures, options.pictures)
 
 
 def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[dict[str, str]]]:
@@ -217,15 +220,6 @@ def _write(options: argparse.Namespace, summary: dict[str, Any]) -> None:
         Path(options.markdown).write_text(format_report(summary, "markdown"), encoding="utf-8")
     if options.latex:
         Path(options.latex).write_text(format_report(summary, "latex"), encoding="utf-8")
-
-
-def _pictured(summary: dict[str, Any], methods: Sequence[Method], reference: str | None) -> list[Method]:
-    """The best row beside the reference, and the reference."""
-    chosen = choose_reference([method.name for method in methods], reference)
-    others = [row for row in summary["rows"] if row["scene"] == ALL_SCENES and row["method"] != chosen]
-    rivals = [row for row in others if not is_ours(row["method"])] or others
-    names = [row["method"] for row in sorted(rivals, key=lambda row: -float(row["mAP@20"]))[:1]] + [chosen]
-    return [method for name in names for method in methods if method.name == name]
 
 
 if __name__ == "__main__":

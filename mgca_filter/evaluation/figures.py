@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .summary import ALL_SCENES
+from .pairs import ALL_SCENES
+from .summary import is_ours
 
 MAX_RIVALS = 6
 """Rivals in the picture of recall: the best by mAP@20, beside all rows of ours."""
@@ -24,11 +25,6 @@ _STYLE: dict[Any, Any] = {
     "svg.hashsalt": "mgca_filter",  # the same figures give the same file
     "svg.fonttype": "none",
 }
-
-
-def is_ours(method: str) -> bool:
-    """Whether a row is the filter's own, by its name."""
-    return "product" in method or "network" in method
 
 
 def draw_figures(summary: Mapping[str, Any], folder: str | Path, prefix: str = "") -> list[Path]:

@@ -14,6 +14,9 @@ from ..errors import DatasetError
 from ..scene_bundle import ScenePair
 from .sources import PairSource, open_sources
 
+ALL_SCENES, ALL_PAIRS = "all", "pairs"
+"""What rows of figures are called that are means over scenes and over pairs; no scene may have these names."""
+
 
 @dataclass(frozen=True)
 class SceneSelection:
@@ -70,7 +73,8 @@ def select_pairs(
         data_format, images: as in :func:`sources.open_sources`.
 
     Raises:
-        DatasetError: there is no scene, a wanted one is not there, or a file is broken or holds no pair.
+        DatasetError: there is no scene, a wanted one is not there, one has the name of a mean, or a file is broken or
+            holds no pair.
         ValueError: ``per_scene`` is below 1, or the format is unknown.
         ImportError: the package that reads the format is not installed.
     """
@@ -78,6 +82,9 @@ def select_pairs(
         raise ValueError(f"per_scene must be at least 1 or None, got {per_scene}")
     listed = [paths] if isinstance(paths, (str, Path)) else list(paths)
     sources = open_sources(listed, data_format, images)
+    for source in sources:
+        if source.scene in (ALL_SCENES, ALL_PAIRS):
+            raise DatasetError(f"{source.path}: a scene cannot be called {source.scene!r}, as a mean is; rename it")
     if scenes is not None:
         absent = sorted(set(scenes) - {source.scene for source in sources})
         if absent:

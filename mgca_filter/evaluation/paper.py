@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from .pairs import ALL_PAIRS, ALL_SCENES
 from .report import Style, render_table
-from .summary import ALL_PAIRS, ALL_SCENES
 
 NOT_MEASURED = "not measured"
 OTHER_SCENES = "our scenes"

@@ -7,7 +7,8 @@ from typing import Any, Literal
 
 from .environment import BUSY_LOAD
 from .methods import UNREADABLE
-from .summary import ALL_PAIRS, ALL_SCENES, INTERVAL_STATISTICS
+from .pairs import ALL_PAIRS, ALL_SCENES
+from .summary import INTERVAL_STATISTICS
 
 Style = Literal["text", "markdown", "latex"]
 COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms", "p95_ms")

@@ -22,10 +22,10 @@ from .metrics import (
     percentile_interval,
     resampled_figures,
 )
+from .pairs import ALL_PAIRS, ALL_SCENES
 from .predict import SceneOutcomes
 from .timing import Timing
 
-ALL_SCENES, ALL_PAIRS = "all", "pairs"
 INTERVAL_STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
 COUNTS = ("failures", "unreadable", "paper_dropped", "timed_pairs")
 """Numbers of pairs, which the mean over scenes adds up; ``pairs`` itself among them."""
@@ -199,6 +199,18 @@ def choose_reference(names: Sequence[str], reference: str | None) -> str:
             raise ValueError(f"reference {reference!r} is not among the methods: {', '.join(names)}")
         return reference
     return next((name for name in names if name.endswith("product")), names[-1])
+
+
+def is_ours(method: str) -> bool:
+    """Whether a row is the filter's own, by its name."""
+    return "product" in method or "network" in method
+
+
+def best_rival(summary: Mapping[str, Any], reference: str) -> str:
+    """The row of the highest mAP@20 beside the reference, not one of ours where there are others; alone, itself."""
+    others = [row for row in summary["rows"] if row["scene"] == ALL_SCENES and row["method"] != reference]
+    rivals = [row for row in others if not is_ours(row["method"])] or others
+    return str(max(rivals, key=lambda row: row["mAP@20"])["method"]) if rivals else reference
 
 
 def _differences(
