@@ -1,8 +1,8 @@
 """Put the scoreboard into README, model card and figures: ``python export/write_tables.py docs/scoreboard.json``.
 
 The JSON file comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures need
-matplotlib; those that the file holds the curves for are written to ``docs/figures``, and what the filter and its best
-rival keep on the example pair.
+matplotlib; those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best
+rival and plain RANSAC keep of the example pair: right matches green, wrong ones red.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mgca_filter.evaluation.environment import BUSY_LOAD
 from mgca_filter.evaluation.figures import draw_figures
 from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.qualitative import draw_pairs
-from mgca_filter.evaluation.registry import parse_method
+from mgca_filter.evaluation.registry import RIVAL_ROWS, parse_method
 from mgca_filter.evaluation.report import timed_pairs
 from mgca_filter.evaluation.summary import best_rival
 
@@ -75,7 +75,7 @@ def section(summary: dict[str, Any]) -> str:
         f"OpenCV {versions.get('opencv-contrib-python-headless', '?')}, {summary['machine'].get('processor', 'CPU')}."
         f"{caution} "
         "Command: `python -m mgca_filter.evaluation BUNDLES`; figures with bootstrap intervals, by scene: "
-        "`docs/scoreboard.json`; curves: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
+        "`docs/scoreboard.json`; curves and a picture: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
         "",
     ]
     return "\n".join(lines)
@@ -98,7 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in FILES:
         path = options.root / name
         path.write_text(fill(path.read_text(encoding="utf-8"), section(summary), str(path)), encoding="utf-8")
-    rows = [parse_method(name) for name in (best_rival(summary, "product"), "product")]
+    pictured = dict.fromkeys([RIVAL_ROWS[0], best_rival(summary, "product"), "product"])
+    rows = [parse_method(name) for name in pictured]
     example = select_pairs(ROOT / EXAMPLE, data_format="pairs")
     for figure in (
         *draw_figures(summary, options.root / FIGURES),

@@ -18,6 +18,7 @@ from .pairs import SceneSelection
 from .predict import answer_pair
 from .sources.base import Image
 
+JPEG_QUALITY = 85
 SOLVED_DEG = 5.0
 """Pose error below which a strip's mark is green."""
 
@@ -43,7 +44,8 @@ def draw_pairs(
             if images is None:
                 continue
             files.append(folder / f"{pair.scene}_{index}.jpg")
-            cv2.imwrite(str(files[-1]), np.vstack([_strip(method, pair, images) for method in methods]))
+            picture = np.vstack([_strip(method, pair, images) for method in methods])
+            cv2.imwrite(str(files[-1]), picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     return files
 
 

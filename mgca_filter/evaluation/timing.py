@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +16,8 @@ from .methods import Method
 from .metrics import FloatArray
 from .predict import answer_pair
 from .store import ResultStore
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,7 @@ def time_methods(methods: Sequence[Method], pairs: Sequence[ScenePair], store: R
     """
 
     def measure() -> dict[str, Any]:
+        logger.info("timing %d rows in turn on %d pairs", len(methods), len(pairs))
         meter = CpuMeter()
         times = interleaved_ms(methods, pairs)
         scenes = list(dict.fromkeys(pair.scene for pair in pairs))
