@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
@@ -13,6 +14,8 @@ from .methods import Method
 from .registry import parse_method
 from .store import ResultStore
 from .timing import interleaved_ms
+
+logger = logging.getLogger(__name__)
 
 MIN_ITERATIONS, MAX_ITERATIONS = 50, 1 << 20
 BISECTIONS = 2
@@ -62,6 +65,7 @@ def match_times(names: Sequence[str], like: Method, pairs: Sequence[ScenePair], 
 
 def _search(name: str, like: Method, pairs: Sequence[ScenePair]) -> TimeMatch:
     """Doubles or halves the iterations past the target, then divides the bracket in the logarithm."""
+    logger.info("%s: looking for the iterations that take as long as %s", name, like.name)
 
     def share(iterations: int) -> float:
         rival = parse_method(f"{name} {iterations} iterations")
