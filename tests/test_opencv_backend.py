@@ -17,7 +17,7 @@ from test_backends import BackendContract, random_input
 
 import mgca_filter
 from mgca_filter import BackendError, ModelError, filter_matches
-from mgca_filter.backends import Backend, OpenCvBackend, open_backend
+from mgca_filter.backends import Backend, OpenCvBackend, open_backend, shared_backend
 from mgca_filter.backends.onnx_file import read_onnx_file
 
 opencv5 = pytest.mark.skipif(int(cv2.__version__.split(".")[0]) < 5, reason="the backend needs OpenCV 5")
@@ -37,31 +37,34 @@ class TestOpenCvBackend(BackendContract):
             np.testing.assert_array_equal(array, copy)
 
 
+@pytest.fixture(scope="module")
+def shipped() -> Backend:
+    """The shipped model, which OpenCV takes seconds to open."""
+    return shared_backend(mgca_filter.model_path(), "opencv")
+
+
 @opencv5
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 127, 512, 2000])
-def test_the_shipped_model_says_what_onnx_runtime_says(count: int) -> None:
-    path = mgca_filter.model_path()
-    row = parity.compare(open_backend(path, "opencv"), open_backend(path, "onnxruntime"), count)
+def test_the_shipped_model_says_what_onnx_runtime_says(shipped: Backend, count: int) -> None:
+    row = parity.compare(shipped, shared_backend(mgca_filter.model_path(), "onnxruntime"), count)
     assert row.passed, parity.format_parity([row])
 
 
 @opencv5
-def test_a_batch_says_what_its_pairs_say() -> None:
-    backend = OpenCvBackend(mgca_filter.model_path())
+def test_a_batch_says_what_its_pairs_say(shipped: Backend) -> None:
     pairs = [parity.two_view_input(40, seed) for seed in range(3)]
-    logits, essential = backend.infer(*(np.concatenate(arrays) for arrays in zip(*pairs)))
+    logits, essential = shipped.infer(*(np.concatenate(arrays) for arrays in zip(*pairs)))
     assert essential.shape == (3, 3, 3)
     for index, pair in enumerate(pairs):
-        np.testing.assert_allclose(logits[index], backend.infer(*pair)[0][0], atol=2e-2)
+        np.testing.assert_allclose(logits[index], shipped.infer(*pair)[0][0], atol=2e-2)
 
 
 @opencv5
-def test_threads_do_not_mix_their_pairs() -> None:
-    backend = OpenCvBackend(mgca_filter.model_path())
+def test_threads_do_not_mix_their_pairs(shipped: Backend) -> None:
     inputs = [parity.two_view_input(count, seed=count) for count in (30, 40, 50, 60)]
-    expected = [backend.infer(*pair)[0] for pair in inputs]
+    expected = [shipped.infer(*pair)[0] for pair in inputs]
     with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(lambda pair: backend.infer(*pair)[0], inputs * 5))
+        results = list(pool.map(lambda pair: shipped.infer(*pair)[0], inputs * 5))
     for result, wanted in zip(results, expected * 5):
         np.testing.assert_array_equal(result, wanted)
 
