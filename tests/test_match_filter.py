@@ -272,7 +272,6 @@ def test_many_matches_are_all_tested(model_file: Path, bare: bool) -> None:
     assert result.status is Status.OK
     assert result.mask[scene.inlier].mean() > 0.95
     assert result.mask[~scene.inlier].mean() < 0.1
-    assert result.info["timings_ms"]["verdict"] < 5000
     if not bare:
         sent = result.info["logits"] >= np.sort(result.info["logits"])[-MAX_NETWORK_MATCHES]
         assert scene.attributes.ratio[sent].max() <= scene.attributes.ratio[~sent].min() + 1e-6
