@@ -521,3 +521,13 @@ def test_command_names_what_is_wrong(folder, tmp_path, capsys):
     assert "NN + LMEDS 2 px" in capsys.readouterr().err
     assert main([str(folder), "--methods", "product", "--model", str(tmp_path / "absent.onnx"), "-q"]) == 2
     assert "absent.onnx" in capsys.readouterr().err
+
+
+def test_command_refuses_before_it_runs(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(predict_module, "evaluate_pair", None)  # whoever calls it fails
+    arguments = [str(folder), "--methods", PROSAC, "-q"]
+    assert main([*arguments, "--reference", "NN + RANSAC 1 px"]) == 2
+    assert "reference 'NN + RANSAC 1 px' is not among the methods" in capsys.readouterr().err
+    for option in ("--json", "--markdown", "--latex"):
+        assert main([*arguments, option, str(tmp_path / "absent" / "out")]) == 2
+        assert f"error: {option}: {tmp_path / 'absent' / 'out'}" in capsys.readouterr().err

@@ -133,6 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> None:
     """Draw the pairs, run the methods, sum up, and write what was asked for."""
+    _check_outputs(options)
     selections = select_pairs(
         options.path,
         options.scenes,
@@ -152,21 +153,29 @@ def run(options: argparse.Namespace) -> None:
         time_matched = match_times(names, like, sample, store)
         methods += [parse_method(match.method) for match in time_matched]
         not_installed += lacking
+    reference = choose_reference([method.name for method in methods], options.reference)
     results = predict(
         methods, selections, seeds=options.seeds, workers=options.workers, store=store, progress=not options.quiet
     )
     timing = time_methods(methods, sample_pairs(selections, options.times), store) if options.times else None
     context = {**_context(options, selections, methods), "not_installed": not_installed}
     context["time_matched"] = [asdict(match) for match in time_matched]
-    settings = {"reference": options.reference, "replicates": options.bootstrap, "seed": options.seed}
+    settings = {"reference": reference, "replicates": options.bootstrap, "seed": options.seed}
     summary = summarize(results, context, timing, **settings)
     _write(options, summary)
     if options.figures:
         draw_figures(summary, options.figures)
-        reference = choose_reference([method.name for method in methods], options.reference)
         shown = dict.fromkeys([best_rival(summary, reference), reference])
         pictured = [method for name in shown for method in methods if method.name == name]
         draw_pairs(pictured, selections, options.figures, options.pictures)
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Raise ValueError now rather than after a long run where a file cannot be written."""
+    for name in ("json", "markdown", "latex"):
+        path = getattr(options, name)
+        if path not in (None, "-") and not Path(path).parent.is_dir():
+            raise ValueError(f"--{name}: {path}: its folder is not there")
 
 
 def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[dict[str, str]]]:
