@@ -57,3 +57,7 @@ class FilterResult:
     status: Status
     num_inliers: int
     info: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        """The verdict and the counts; the arrays would fill the screen."""
+        return f"FilterResult(status={self.status.value!r}, {self.num_inliers} of {len(self.mask)} matches kept)"
