@@ -15,7 +15,7 @@ from .matching import match_descriptors
 from .result import FilterResult
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ImageMatchResult:
     """Answer of :func:`match_images`.
 

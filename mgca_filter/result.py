@@ -24,7 +24,7 @@ class Status(enum.Enum):
     SUSPICIOUS_INTRINSICS = "suspicious_intrinsics"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FilterResult:
     """Answer of :func:`mgca_filter.filter_matches`; M is the number of matches that came in.
 
