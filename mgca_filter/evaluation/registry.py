@@ -55,6 +55,7 @@ RIVAL_ROWS = (
     "mutual + ratio 0.9 + PROSAC 0.5 px",
     "mutual + ratio 0.9 + PROSAC 0.75 px",
     "mutual + ratio 0.9 + PoseLib 0.75 px",
+    "mutual + ratio 0.85 + PoseLib progressive 0.75 px",
     "mutual + ratio 0.9 + PoseLib progressive 0.75 px",
 )
 
