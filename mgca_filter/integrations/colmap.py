@@ -21,7 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from .engines import Engine
-from .journal import Journal, PipelineError, replaced_when_done, sqlite_errors
+from .journal import Journal, PipelineError, output_file, sqlite_errors
 from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
@@ -85,7 +85,7 @@ class ColmapJob:
         if self.output.exists() and self.output.samefile(self.database):
             copy_database(finished, self.output)  # one transaction: the old content or the new
         else:
-            with replaced_when_done(self.output) as partial:
+            with output_file(self.output) as partial:
                 finished.replace(partial)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from .engines import Engine
-from .journal import file_stamp, replaced_when_done
+from .journal import file_stamp, output_file
 from .pair_job import progress_bar
 from .pair_worker import ImageFeatures
 
@@ -61,7 +61,7 @@ class FeatureCache:
 
     def _write(self, name: str, features: ImageFeatures) -> None:
         size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))
-        with replaced_when_done(self._path(name)) as partial, partial.open("wb") as file:
+        with output_file(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(
                 file,
                 keypoints=np.column_stack([features.points, size, angle]),

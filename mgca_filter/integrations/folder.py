@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from .engines import Engine
 from .feature_cache import FeatureCache
-from .journal import Journal, replaced_when_done
+from .journal import Journal, output_file
 from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
@@ -91,7 +91,7 @@ class FolderJob:
     def _write(self, names: Sequence[str], read: ReadFeatures, journal: Journal) -> None:
         wanted = set(self.pairs)
         rows = (row for row in journal.rows() if (row.name1, row.name2) in wanted)
-        with replaced_when_done(self.output) as partial:
+        with output_file(self.output) as partial:
             if self.output.suffix == ".db":
                 from .colmap_writer import write_database
 
@@ -99,7 +99,7 @@ class FolderJob:
             elif self.output.suffix == ".h5":
                 from .hloc_writer import write_features, write_matches
 
-                with replaced_when_done(self.output.with_suffix(".features.h5")) as partial_features:
+                with output_file(self.output.with_suffix(".features.h5")) as partial_features:
                     write_features(partial_features, names, read)
                 write_matches(partial, read, rows)
             else:

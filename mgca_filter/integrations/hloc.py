@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .engines import Engine
-from .journal import Journal, PipelineError, file_stamp, replaced_when_done
+from .journal import Journal, PipelineError, file_stamp, output_file
 from .pair_job import Summary, run_identity, run_pairs, work_folder
 from .pair_worker import ImageFeatures, PairRow
 
@@ -56,7 +56,7 @@ class HlocJob:
             try:
                 journal.begin({"inputs": inputs, "descriptors": self.use_descriptors, **run_identity(filter_options)})
                 summary = run_pairs(source, engine, journal, quiet)
-                with replaced_when_done(self.output) as partial:
+                with output_file(self.output) as partial:
                     shutil.copyfile(self.matches, partial)
                     with h5py.File(partial, "r+") as filtered:
                         drop_matches(filtered, source.groups, journal.rows())

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import atomic_file
+from ..atomic_file import replaced_when_done
 from ..errors import MgcaFilterError
 from .pair_worker import PairRow
 
@@ -147,14 +147,14 @@ def sqlite_errors(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replaced_when_done(path: Path) -> Iterator[Path]:
-    """As :func:`mgca_filter.atomic_file.replaced_when_done`, for the user's own output.
+def output_file(path: Path) -> Iterator[Path]:
+    """A temporary name beside ``path``, as of :func:`mgca_filter.atomic_file.replaced_when_done`.
 
     Raises:
         PipelineError: writing fails, with an exception of the system or of HDF5.
     """
     try:
-        with atomic_file.replaced_when_done(path) as temporary:
+        with replaced_when_done(path) as temporary:
             yield temporary
     except (OSError, RuntimeError) as error:
         words = getattr(error, "strerror", None) or " ".join(str(error).split())

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..atomic_file import replaced_when_done
 from ..errors import MgcaFilterError
 from ..network.weights import count_parameters
 from ..scene_bundle import ScenePair, load_scene_bundles
@@ -84,9 +85,8 @@ class Ablation:
             "seconds": time.perf_counter() - start,
             "figures": quick_validation(done[-1].average, self.pairs),
         }
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(result, indent=1), encoding="utf-8")
-        partial.replace(path)
+        with replaced_when_done(path) as partial:
+            partial.write_text(json.dumps(result, indent=1), encoding="utf-8")
         return result
 
     def write(self, rows: Sequence[dict[str, Any]], command: str) -> None:
