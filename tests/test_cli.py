@@ -227,7 +227,7 @@ def test_wrong_intrinsics(capsys, words):
         ([LEFT, str(IMAGES / "pair.json")], ["pair.json"]),
         ([LEFT, RIGHT, "-o", "no/such/folder/m.png"], ["no/such/folder/m.png"]),
         ([LEFT, RIGHT, "-o", "m.nonsense"], ["m.nonsense"]),
-        ([LEFT, RIGHT, "-o", "m"], ["m: ", ".png"]),
+        ([LEFT, RIGHT, "-o", "without_suffix"], ["without_suffix: ", ".png"]),
         ([LEFT, RIGHT, "-o", LEFT], ["left.jpg", "is one of the images"]),
         ([LEFT, RIGHT, "--npz", RIGHT], ["right.jpg", "is one of the images"]),
         ([LEFT, RIGHT, "--json", str(IMAGES)], [str(IMAGES)]),
