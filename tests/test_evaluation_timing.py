@@ -89,6 +89,9 @@ def test_times_are_taken_once_for_the_same_rows_and_pairs(clocked: Any, pairs: l
     assert time_methods([clocked("a", 50.0), clocked("c", 70.0)], pairs, store).milliseconds["a"] != first
     other = time_methods([clocked("a", 50.0), clocked("b", 70.0)], pairs[:1], store)
     assert other.milliseconds["a"] == {"scene": pytest.approx([50.0])}
+    namesakes = [as_pair(make_scene(seed=seed), seed) for seed in (1, 0)]
+    other = time_methods([clocked("a", 60.0), clocked("b", 70.0)], namesakes, store)
+    assert other.milliseconds["a"] == {"scene": pytest.approx([60.0, 60.0])}
 
 
 def test_one_thread_holds_within_the_block_alone(monkeypatch: pytest.MonkeyPatch) -> None:

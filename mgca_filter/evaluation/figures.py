@@ -13,6 +13,7 @@ MAX_RIVALS = 6
 """Rivals in the picture of recall: the best by mAP@20, beside all rows of ours."""
 
 _GREY = "#8a8f98"
+_LEGEND_ROW_INCHES = 0.17
 _STYLE: dict[Any, Any] = {
     "figure.figsize": (6.4, 4.2),
     "font.size": 9,
@@ -64,7 +65,10 @@ def draw_figures(summary: Mapping[str, Any], folder: str | Path, prefix: str = "
 
 def draw_recall(axes: Any, summary: Mapping[str, Any]) -> None:
     """Share of pairs below each pose error, mean over scenes; ours solid, rivals dashed."""
+    from matplotlib import colormaps
+
     curves = summary["curves"]["recall"]
+    axes.set_prop_cycle(color=colormaps["tab20"].colors)  # more lines than the usual ten colours
     for name in _shown(summary):
         style = {"linestyle": "-", "linewidth": 1.8} if is_ours(name) else {"linestyle": "--", "linewidth": 1.1}
         shares = [100.0 * share for share in curves["methods"][name]]
@@ -118,7 +122,7 @@ def draw_time_accuracy(axes: Any, summary: Mapping[str, Any]) -> None:
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), handletextpad=0.2)
-    axes.figure.set_size_inches(9.0, 4.8)
+    axes.figure.set_size_inches(9.0, max(4.8, 0.8 + _LEGEND_ROW_INCHES * len(rows)))
 
 
 def _different(methods: Mapping[str, Any]) -> dict[str, Any]:

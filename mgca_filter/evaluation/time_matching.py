@@ -9,11 +9,10 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ..scene_bundle import ScenePair
-from .environment import processor_name
 from .methods import Method
 from .registry import parse_method
 from .store import ResultStore
-from .timing import interleaved_ms
+from .timing import circumstances, interleaved_ms
 
 logger = logging.getLogger(__name__)
 
@@ -57,8 +56,7 @@ def match_times(names: Sequence[str], like: Method, pairs: Sequence[ScenePair], 
     """
     if not pairs:
         raise ValueError("times cannot be matched: not one pair can be read")
-    where = {"pairs": [pair.name for pair in pairs], "machine": processor_name()}
-    depends_on = {"rows": list(names), "like": like.name, "settings": like.settings(), **where}
+    depends_on = {"rows": list(names), "like": like.name, "settings": like.settings(), **circumstances(pairs)}
     matches = store.once("time-matched", depends_on, lambda: [asdict(_search(name, like, pairs)) for name in names])
     return [TimeMatch(**fields) for fields in matches]
 

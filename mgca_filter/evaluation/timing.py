@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 from collections.abc import Sequence
@@ -54,8 +55,14 @@ def time_methods(methods: Sequence[Method], pairs: Sequence[ScenePair], store: R
         return asdict(Timing(milliseconds, processor_name(), meter.others_load()))
 
     settings = {method.name: method.settings() for method in methods}
-    depends_on = {"methods": settings, "pairs": [pair.name for pair in pairs], "machine": processor_name()}
+    depends_on = {"methods": settings, **circumstances(pairs)}
     return Timing(**store.once("times", depends_on, measure))
+
+
+def circumstances(pairs: Sequence[ScenePair]) -> dict[str, Any]:
+    """What times depend on besides the methods: the pairs, by name and digest of their points, and the processor."""
+    digests = [hashlib.sha256(pair.points1.tobytes() + pair.points2.tobytes()).hexdigest() for pair in pairs]
+    return {"pairs": {pair.name: digest for pair, digest in zip(pairs, digests)}, "machine": processor_name()}
 
 
 def interleaved_ms(methods: Sequence[Method], pairs: Sequence[ScenePair]) -> FloatArray:
