@@ -79,8 +79,9 @@ def test_auc_is_the_area_of_the_trapezoids():
 )
 def test_auc_equals_the_trapezoids_of_the_sorted_errors(errors, limit):
     below = sorted(error for error in errors if error < limit)
-    recall = [i / len(errors) for i in range(len(below) + 1)]
-    area = np.trapezoid([*recall, recall[-1]], [0.0, *below, limit])
+    x = [0.0, *below, limit]
+    y = [i / len(errors) for i in (*range(len(below) + 1), len(below))]
+    area = sum((x[i + 1] - x[i]) * (y[i] + y[i + 1]) / 2 for i in range(len(x) - 1))
     assert area_under_recall(errors, limit) == pytest.approx(area / limit)
 
 

@@ -107,7 +107,7 @@ def read_image(path: Path) -> Image:
     """
     if not path.is_file():
         raise DatasetError(f"{path}: image missing")
-    image: Any = cv2.imread(str(path), cv2.IMREAD_COLOR_BGR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image: Any = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise DatasetError(f"{path}: not an image that OpenCV can read")
     return np.asarray(image, dtype=np.uint8)
