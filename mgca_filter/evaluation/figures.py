@@ -68,7 +68,7 @@ def draw_recall(axes: Any, summary: Mapping[str, Any]) -> None:
     from matplotlib import colormaps
 
     curves = summary["curves"]["recall"]
-    axes.set_prop_cycle(color=colormaps["tab20"].colors)  # more lines than the usual ten colours
+    axes.set_prop_cycle(color=[colormaps["tab20"](i) for i in range(20)])  # more lines than the usual ten colours
     for name in _shown(summary):
         style = {"linestyle": "-", "linewidth": 1.8} if is_ours(name) else {"linestyle": "--", "linewidth": 1.1}
         shares = [100.0 * share for share in curves["methods"][name]]
