@@ -3,6 +3,7 @@
 import configparser
 import subprocess
 import sys
+import venv
 import zipfile
 from pathlib import Path
 
@@ -65,5 +66,24 @@ def test_wheel_alone_runs_the_command_outside_the_source_tree(wheel, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", code, str(tmp_path / "site"), *pair], capture_output=True, text=True, cwd=tmp_path
     )
+    assert done.returncode == 0, done.stderr
+    assert "status ok" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_filter_runs_over_the_plain_opencv_wheel(wheel, tmp_path):
+    """Both wheels write the folder cv2; whichever files win, the filter works."""
+    python = tmp_path / "env" / "bin" / "python"
+    venv.create(tmp_path / "env", with_pip=True)
+    install = [str(python), "-m", "pip", "install", "-q"]
+    if subprocess.run([*install, "opencv-python"], capture_output=True).returncode:
+        pytest.skip("no package index")
+    subprocess.run([*install, str(wheel)], check=True, capture_output=True)
+    listed = subprocess.run([str(python), "-m", "pip", "list"], check=True, capture_output=True, text=True).stdout
+    assert {"opencv-python", "opencv-contrib-python-headless"} <= set(listed.split())
+    images = ROOT / "examples" / "images"
+    command = [str(python), "-m", "mgca_filter", str(images / "left.jpg"), str(images / "right.jpg")]
+    done = subprocess.run([*command, "--K", "820,820,511.5,383.5"], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "status ok" in done.stdout
