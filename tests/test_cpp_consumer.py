@@ -1,141 +1,46 @@
-"""The C++ example builds without warnings and answers as Python does.
+"""The C++ example answers as Python does and names what it cannot read.
 
-Needs CMake, a C++ compiler, OpenCV's headers and, but for one test, ONNX Runtime's headers and library: in the folder
-that the environment variable ONNXRUNTIME_ROOT names (include/ and lib/), or where CMake looks by itself.
+What it needs: see ``cpp_program.py``.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
-import subprocess
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from conftest import METADATA, K, build_model
+from cpp_program import (
+    BUILD_TIMEOUT,
+    ERROR,
+    FOUND,
+    SOURCE,
+    Pair,
+    assert_same_answer,
+    build,
+    build_program,
+    comma_separated,
+    nearest_neighbours,
+    opencv_version,
+    run,
+    run_program,
+)
 
 import mgca_filter
-from mgca_filter.backends import OnnxBackend
 from mgca_filter.epipolar import pose_error_deg
 from mgca_filter.keypoints import create_detector, detect_keypoints
-from mgca_filter.matching import match_descriptors
 
-SOURCE = Path(__file__).parent.parent / "examples" / "cpp"
 IMAGES = Path(__file__).parent.parent / "examples" / "images"
 K2 = np.array([[700.0, 0.0, 310.0], [0.0, 710.0, 250.0], [0.0, 0.0, 1.0]])
-FOUND, NOTHING_FOUND, ERROR = 0, 1, 2
-# The compiler may take minutes on a busy machine.
-pytestmark = pytest.mark.timeout(1200)
-
-
-# Toolchain and programs
-
-
-def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([str(word) for word in command], capture_output=True, text=True)
+pytestmark = BUILD_TIMEOUT
 
 
 @pytest.fixture(scope="module")
-def opencv_version(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, ...]:
-    """Version of the OpenCV that CMake finds."""
-    compiler = os.environ.get("CXX", "c++")
-    for tool in ("cmake", compiler):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} not found")
-    folder = tmp_path_factory.mktemp("probe")
-    probe = "cmake_minimum_required(VERSION 3.16)\nproject(probe CXX)\nfind_package(OpenCV QUIET)\n"
-    (folder / "CMakeLists.txt").write_text(probe + 'message(STATUS "OpenCV=${OpenCV_VERSION}")\n')
-    found = re.search(r"OpenCV=([\d.]+)", run("cmake", "-S", folder, "-B", folder / "build").stdout)
-    if found is None:
-        pytest.skip("OpenCV's headers and CMake files not found (Debian: libopencv-dev)")
-    return tuple(int(part) for part in found[1].split("."))
-
-
-def build(folder: Path, *options: str) -> Path:
-    """The program, built with warnings as errors."""
-    done = run("cmake", "-S", SOURCE, "-B", folder, "-DCMAKE_CXX_FLAGS=-Werror", *options)
-    assert done.returncode == 0, done.stdout + done.stderr
-    done = run("cmake", "--build", folder, "--config", "Release")
-    assert done.returncode == 0, done.stdout + done.stderr
-    return next(path for path in folder.rglob("mgca_match_cpp*") if path.is_file() and os.access(path, os.X_OK))
-
-
-@pytest.fixture(scope="module")
-def program(opencv_version: tuple[int, ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program on ONNX Runtime."""
-    folder = tmp_path_factory.mktemp("cpp")
-    if "ONNXRUNTIME_ROOT" not in os.environ:
-        done = run("cmake", "-S", SOURCE, "-B", folder)
-        if "runs on ONNX Runtime" not in done.stdout:
-            pytest.skip("ONNX Runtime's headers and library not found; ONNXRUNTIME_ROOT may name their folder")
-    return build(folder)
-
-
-# Both answers
-
-
-@dataclass(frozen=True)
-class Pair:
-    """What goes into both programs."""
-
-    keypoints1: list[cv2.KeyPoint]
-    keypoints2: list[cv2.KeyPoint]
-    matches: Sequence[Any]
-    K1: np.ndarray
-    K2: np.ndarray
-
-    def write(self, path: Path) -> Path:
-        """As a file for ``--matches``; every row has as many candidates as the first."""
-        rows = [[match] if isinstance(match, cv2.DMatch) else match for match in self.matches]
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-        for name, keypoints in (("keypoints1", self.keypoints1), ("keypoints2", self.keypoints2)):
-            storage.write(name, np.array([(*k.pt, k.size, k.angle) for k in keypoints], np.float32))
-        storage.write("matches", np.array([(row[0].queryIdx, row[0].trainIdx) for row in rows], np.int32))
-        storage.write("distances", np.array([[match.distance for match in row] for row in rows], np.float32))
-        storage.release()
-        return path
-
-
-def comma_separated(K: np.ndarray) -> str:
-    return ",".join(repr(float(K[index])) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
-
-
-def run_program(program: Path, pair: Pair, model: Path, folder: Path, *options: str) -> dict[str, Any]:
-    """Answer of the C++ program; the exit status agrees with it."""
-    matches = pair.write(folder / "matches.yml")
-    cameras = ("--K", comma_separated(pair.K1), "--K2", comma_separated(pair.K2))
-    done = run(program, "--matches", matches, "--model", model, *cameras, *options)
-    assert done.stdout, done.stderr
-    answer = json.loads(done.stdout)
-    assert done.returncode == (NOTHING_FOUND if answer["E"] is None else FOUND)
-    return answer
-
-
-def assert_same_answer(program: Path, pair: Pair, model: Path, folder: Path, **options: Any) -> None:
-    """Scores and masks of the C++ program against those of Python."""
-    words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
-    answer = run_program(program, pair, model, folder, *words)
-    expected = mgca_filter.filter_matches(
-        pair.keypoints1, pair.keypoints2, pair.matches, K1=pair.K1, K2=pair.K2, model=model, **options
-    )
-    threshold = OnnxBackend(model).metadata.decision_threshold
-    logits = expected.info["logits"]
-    np.testing.assert_allclose(answer["logits"], logits, atol=1e-3)
-    np.testing.assert_allclose(answer["scores"], expected.scores, atol=1e-3)
-    np.testing.assert_array_equal(np.array(answer["network_mask"], bool), logits > threshold)
-    mask = np.array(answer["mask"], bool)
-    union = np.count_nonzero(mask | expected.mask)
-    assert expected.num_inliers > 30
-    assert np.count_nonzero(mask & expected.mask) >= (1.0 if answer["opencv"] == cv2.__version__ else 0.98) * union
-    assert pose_error_deg(answer["R"], answer["t"], expected.R, expected.t) < 0.5
-    np.testing.assert_allclose(min(np.linalg.norm(answer["E"] - s * expected.E) for s in (-1, 1)), 0.0, atol=0.02)
+def program() -> Path:
+    return build_program()
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +48,7 @@ def example() -> Pair:
     """The example images' keypoints and nearest neighbours."""
     K = np.array(json.loads((IMAGES / "pair.json").read_text())["K1"])
     found = [detect_keypoints(cv2.imread(str(IMAGES / name)), create_detector()) for name in ("left.jpg", "right.jpg")]
-    return Pair(found[0][0], found[1][0], match_descriptors(found[0][1], found[1][1]), K, K)
+    return nearest_neighbours(*found, K)
 
 
 def only_nearest(pair: Pair, max_ratio: float = 1.0) -> Pair:
@@ -204,6 +109,16 @@ def test_rule_calibration_prior_and_threshold_come_from_the_file(program, small,
         "prior": json.dumps({**prior, "weight2": [-4.0, 2.0], "bias2": -1}),
     }
     assert_same_answer(program, small, build_model(tmp_path / "other.onnx", metadata), tmp_path)
+
+
+@pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 3), (2, 3)])
+def test_rendered_views_get_the_answer_of_python(program, views, tmp_path, first, second):
+    a, b = views[first], views[second]
+    pair = nearest_neighbours((a.keypoints, a.descriptors), (b.keypoints, b.descriptors), a.K)
+    assert_same_answer(program, pair, mgca_filter.model_path(), tmp_path)
+
+
+# Little to go on
 
 
 def test_too_few_matches_give_scores_and_no_geometry(program, small, model_file, tmp_path):
@@ -282,14 +197,15 @@ def test_index_out_of_range_is_named(program, small, model_file, tmp_path):
 # Without ONNX Runtime
 
 
-def test_opencv_5_runs_the_network(opencv_version, example, tmp_path):
-    if opencv_version < (5,):
+def test_opencv_5_runs_the_network(example, tmp_path):
+    if opencv_version() < (5,):
         pytest.skip("cv::dnn of OpenCV 4 cannot run the model")
-    assert_same_answer(build(tmp_path, "-DMGCA_USE_OPENCV_DNN=ON"), example, mgca_filter.model_path(), tmp_path)
+    program = build(SOURCE, tmp_path, "mgca_match_cpp", "-DMGCA_USE_OPENCV_DNN=ON")
+    assert_same_answer(program, example, mgca_filter.model_path(), tmp_path)
 
 
-def test_opencv_4_alone_is_refused(opencv_version, tmp_path):
-    if opencv_version >= (5,):
+def test_opencv_4_alone_is_refused(tmp_path):
+    if opencv_version() >= (5,):
         pytest.skip("OpenCV 5 runs the model by itself")
     done = run("cmake", "-S", SOURCE, "-B", tmp_path, "-DMGCA_USE_OPENCV_DNN=ON")
     assert done.returncode != 0

@@ -4,28 +4,27 @@
 //     const mgca::MgcaFilter filter("mgca_small.onnx");
 //     const mgca::FilterResult result = filter(keypoints1, keypoints2, knn_matches, K1, K2);
 //
-// Header-only, C++17: copy the three mgca_*.hpp files. Needs OpenCV 4.5.1 or newer, and ONNX Runtime 1.15 or newer or
-// OpenCV 5 (see mgca_model.hpp).
+// Header-only, C++17: copy the mgca_*.hpp files. Needs OpenCV 4.5.1 or newer, and ONNX Runtime 1.15 or newer or
+// OpenCV 5 (see mgca_network.hpp).
 
 #pragma once
 
+#include "mgca_epipolar.hpp"
 #include "mgca_model.hpp"
-#include "mgca_two_view.hpp"
+#include "mgca_network.hpp"
+#include "mgca_pair.hpp"
+#include "mgca_ranking.hpp"
+#include "mgca_robust_fit.hpp"
 
 #include <opencv2/core.hpp>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstddef>
 #include <filesystem>
-#include <iterator>
-#include <limits>
-#include <numeric>
 #include <optional>
 #include <random>
 #include <stdexcept>
-#include <string>
 #include <utility>
 #include <vector>
 
@@ -57,10 +56,6 @@ struct FilterResult {
 /// The filter; keeps its model open. Safe to use from several threads.
 class MgcaFilter {
 public:
-    /// One row of cv::DescriptorMatcher::knnMatch per match: the first candidate is the match, the second gives the
-    /// ratio of distances.
-    using KnnMatches = std::vector<std::vector<cv::DMatch>>;
-
     /// Throws ModelError where the model file is missing, damaged, or of another contract, and std::invalid_argument
     /// for an option out of range.
     explicit MgcaFilter(const std::filesystem::path& model_file, const FilterOptions& options = {})
@@ -85,13 +80,13 @@ public:
     /// where the network fails (see Network::infer). Data never raises: too few matches give a result without geometry.
     FilterResult operator()(const std::vector<cv::KeyPoint>& keypoints1, const std::vector<cv::KeyPoint>& keypoints2,
                             const KnnMatches& matches, const cv::Matx33d& K1, const cv::Matx33d& K2) const {
-        const Pair pair = prepare(keypoints1, keypoints2, matches, K1, K2);
+        const Pair pair = read_pair(keypoints1, keypoints2, matches, K1, K2);
         const std::vector<std::size_t> sent = select_network_input(pair);
         FilterResult result;
         result.logits = compute_logits(pair, sent);
         for (std::size_t i = 0; i < matches.size(); ++i) {
             result.scores.push_back(pair.valid[i] ? metadata_.probability(result.logits[i]) : 0.0F);
-            result.network_mask.push_back(result.logits[i] > metadata_.decision_threshold);
+            result.network_mask.push_back(margin(result.logits[i]) > 0.0F);
         }
         fit(pair, sent, result);
         return result;
@@ -112,142 +107,16 @@ public:
 private:
     // More matches than this do not enter the network: the best by ratio go.
     static constexpr std::size_t kMaxNetworkMatches = 8000;
-    // With fewer accepted matches than this, the best-scored ones fill up what the robust fit sees.
-    static constexpr std::size_t kMinFitMatches = 32;
     // Low enough for a probability of zero under any calibration.
     static constexpr float kInvalidLogit = -100.0F;
     // Matches that stay outside the network stay this far below the decision threshold, whatever the prior says.
     static constexpr double kRejectedMargin = 1e-3;
-    // Normalised coordinates beyond this (89.9 degrees off the axis) come from broken input, not from a lens.
-    static constexpr double kMaxNormalized = 1e3;
-    static constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
 
-    /// Matches of one pair; `valid` where the coordinates are usable.
-    struct Pair {
-        std::vector<Correspondence> correspondences;
-        std::vector<Attributes> attributes;
-        std::vector<bool> valid;
-        double focal_px = 0.0;
-    };
+    /// How far a logit lies above the decision threshold.
+    float margin(float logit) const { return logit - static_cast<float>(metadata_.decision_threshold); }
 
-    /// Step 1: pixels and what the matcher knew, to normalised coordinates and encoded attributes.
-    static Pair prepare(const std::vector<cv::KeyPoint>& keypoints1, const std::vector<cv::KeyPoint>& keypoints2,
-                        const KnnMatches& matches, const cv::Matx33d& K1, const cv::Matx33d& K2) {
-        check_intrinsics(K1, "K1");
-        check_intrinsics(K2, "K2");
-        check_indices(matches, keypoints1.size(), keypoints2.size());
-        const std::optional<std::vector<bool>> best = best_of_list(matches, keypoints2.size());
-        Pair pair;
-        pair.focal_px = (K1(0, 0) + K1(1, 1) + K2(0, 0) + K2(1, 1)) / 4.0;
-        for (std::size_t i = 0; i < matches.size(); ++i) {
-            Attributes attributes{};
-            Correspondence correspondence = Correspondence::all(kUnknown);
-            if (!matches[i].empty()) {
-                const cv::KeyPoint& first = keypoints1[static_cast<std::size_t>(matches[i][0].queryIdx)];
-                const cv::KeyPoint& second = keypoints2[static_cast<std::size_t>(matches[i][0].trainIdx)];
-                const cv::Vec2d x1 = normalize(first.pt, K1), x2 = normalize(second.pt, K2);
-                correspondence = {x1[0], x1[1], x2[0], x2[1]};
-                encode_shape(first, second, attributes);
-            }
-            encode_ratio(matches[i], attributes);
-            if (best) {
-                attributes[1] = (*best)[i] ? 1.0F : 0.0F;
-                attributes[6] = 1.0F;
-            }
-            pair.correspondences.push_back(correspondence);
-            pair.attributes.push_back(attributes);
-            pair.valid.push_back(std::all_of(correspondence.val, correspondence.val + 4,
-                                             [](double x) { return std::abs(x) < kMaxNormalized; }));
-        }
-        return pair;
-    }
-
-    static void check_intrinsics(const cv::Matx33d& K, const char* name) {
-        const bool finite = std::all_of(K.val, K.val + 9, [](double value) { return std::isfinite(value); });
-        if (!finite || K(0, 0) <= 0.0 || K(1, 1) <= 0.0 || K(1, 0) != 0.0 || K(2, 0) != 0.0 || K(2, 1) != 0.0 ||
-            K(2, 2) != 1.0) {
-            throw std::invalid_argument(std::string(name) +
-                                        ": expected [[fx, s, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0");
-        }
-    }
-
-    static void check_indices(const KnnMatches& matches, std::size_t count1, std::size_t count2) {
-        const auto outside = [](int index, std::size_t count) {
-            return index < 0 || static_cast<std::size_t>(index) >= count;
-        };
-        for (std::size_t i = 0; i < matches.size(); ++i) {
-            if (!matches[i].empty() &&
-                (outside(matches[i][0].queryIdx, count1) || outside(matches[i][0].trainIdx, count2))) {
-                throw std::invalid_argument("matches[" + std::to_string(i) + "]: index out of range for " +
-                                            std::to_string(count1) + " and " + std::to_string(count2) + " keypoints");
-            }
-        }
-    }
-
-    static cv::Vec2d normalize(const cv::Point2f& point, const cv::Matx33d& K) {
-        const double y = (point.y - K(1, 2)) / K(1, 1);
-        return {(point.x - K(0, 2) - K(0, 1) * y) / K(0, 0), y};
-    }
-
-    /// Distance of a candidate; unknown where there is none, or where it was never set (OpenCV's largest float).
-    static double distance(const std::vector<cv::DMatch>& row, std::size_t candidate) {
-        const double value = candidate < row.size() ? row[candidate].distance : kUnknown;
-        return std::abs(value) < 1e38 ? value : kUnknown;
-    }
-
-    static void encode_ratio(const std::vector<cv::DMatch>& row, Attributes& attributes) {
-        const double nearest = distance(row, 0), second = distance(row, 1);
-        if (std::isnan(nearest) || std::isnan(second)) {
-            return;
-        }
-        // Two candidates at distance zero cannot be told apart.
-        attributes[0] = static_cast<float>(second <= 0.0 ? 1.0 : std::clamp(nearest / second, 0.0, 1.0));
-        attributes[5] = 1.0F;
-    }
-
-    static void encode_shape(const cv::KeyPoint& first, const cv::KeyPoint& second, Attributes& attributes) {
-        for (const cv::KeyPoint* keypoint : {&first, &second}) {
-            if (!(keypoint->size > 0.0F && keypoint->angle >= 0.0F) || !std::isfinite(keypoint->size) ||
-                !std::isfinite(keypoint->angle)) {
-                return;
-            }
-        }
-        const double turn = (static_cast<double>(second.angle) - first.angle) * CV_PI / 180.0;
-        attributes[2] = static_cast<float>(std::log2(static_cast<double>(second.size) / first.size));
-        attributes[3] = static_cast<float>(std::cos(turn));
-        attributes[4] = static_cast<float>(std::sin(turn));
-        attributes[7] = 1.0F;
-    }
-
-    /// True where no other match reaches the same keypoint of image 2 at a smaller distance; nothing where the
-    /// distances cannot say: some are missing, or several matches all have the same.
-    static std::optional<std::vector<bool>> best_of_list(const KnnMatches& matches, std::size_t count2) {
-        std::vector<double> smallest(count2, std::numeric_limits<double>::infinity());
-        std::vector<double> distances;
-        for (const std::vector<cv::DMatch>& row : matches) {
-            if (row.empty()) {
-                continue;
-            }
-            distances.push_back(distance(row, 0));
-            if (std::isnan(distances.back())) {
-                return std::nullopt;
-            }
-            double& reached = smallest[static_cast<std::size_t>(row[0].trainIdx)];
-            reached = std::min(reached, distances.back());
-        }
-        const auto [low, high] = std::minmax_element(distances.begin(), distances.end());
-        if (distances.empty() || (distances.size() > 1 && *low == *high)) {
-            return std::nullopt;
-        }
-        std::vector<bool> best;
-        for (const std::vector<cv::DMatch>& row : matches) {
-            best.push_back(!row.empty() && distance(row, 0) <= smallest[static_cast<std::size_t>(row[0].trainIdx)]);
-        }
-        return best;
-    }
-
-    /// Step 2: the matches that enter the network: those that are, as far as is known, best of the list and of a low
-    /// ratio, or all of them where these are too few; rows in ascending order.
+    /// The matches that enter the network: those that are, as far as is known, best of the list and of a low ratio, or
+    /// all of them where these are too few; rows in ascending order.
     std::vector<std::size_t> select_network_input(const Pair& pair) const {
         std::vector<std::size_t> all, candidates;
         for (std::size_t i = 0; i < pair.valid.size(); ++i) {
@@ -278,7 +147,7 @@ private:
         return candidates;
     }
 
-    /// Step 3: logits of all matches: the network's, the prior's below the decision threshold, or invalid.
+    /// Logits of all matches: the network's, the prior's below the decision threshold, or invalid.
     std::vector<float> compute_logits(const Pair& pair, const std::vector<std::size_t>& sent) const {
         std::vector<float> logits(pair.valid.size(), kInvalidLogit);
         const auto ceiling = static_cast<float>(metadata_.decision_threshold - kRejectedMargin);
@@ -304,40 +173,19 @@ private:
         return logits;
     }
 
-    /// Step 4: the matches that the robust fit sees, the most promising first: the accepted ones, or the best-scored
-    /// ones where those are few. Saturated scores order badly among themselves; the ratio tells them apart.
-    std::vector<std::size_t> select_for_fit(const Pair& pair, const std::vector<std::size_t>& sent,
-                                            const FilterResult& result) const {
-        std::vector<std::size_t> order;
-        std::copy_if(sent.begin(), sent.end(), std::back_inserter(order),
-                     [&](std::size_t i) { return result.network_mask[i] != 0; });
-        const auto sort_descending = [&](auto&& value) {
-            std::stable_sort(order.begin(), order.end(),
-                             [&](std::size_t i, std::size_t j) { return value(i) > value(j); });
-        };
-        if (order.size() < kMinFitMatches) {
-            order = sent;
-            sort_descending([&](std::size_t i) { return result.logits[i]; });
-            order.resize(std::min(order.size(), kMinFitMatches));
-        }
-        sort_descending([&](std::size_t i) {
-            const Attributes& a = pair.attributes[i];
-            return result.scores[i] * (a[5] > 0.0F ? 1.2 - a[0] : 1.0);
-        });
-        return order;
-    }
-
-    /// Step 5: the robust fit, then all matches are tested against it.
+    /// The robust fit to what the network saw, then all matches are tested against it.
     void fit(const Pair& pair, const std::vector<std::size_t>& sent, FilterResult& result) const {
         result.mask.assign(pair.valid.size(), 0);
-        std::vector<Correspondence> ordered;
-        for (const std::size_t i : select_for_fit(pair, sent, result)) {
-            ordered.push_back(pair.correspondences[i]);
+        std::vector<ScoredMatch> scored;
+        for (const std::size_t i : sent) {
+            const Attributes& a = pair.attributes[i];
+            const std::optional<double> ratio = a[5] > 0.0F ? std::optional<double>(a[0]) : std::nullopt;
+            scored.push_back({pair.correspondences[i], result.scores[i], margin(result.logits[i]), ratio});
         }
         RobustFitOptions fit_options;
         fit_options.confidence = options_.confidence;
         fit_options.seed = options_.seed;
-        const std::optional<Pose> pose = estimate_pose(ordered, pair.focal_px, fit_options);
+        const std::optional<Pose> pose = estimate_pose(RankedMatches(scored), pair.focal_px, fit_options);
         if (!pose) {
             return;
         }

@@ -1,25 +1,8 @@
-// The model file: its metadata, and the network that runs it.
-//
-// With ONNX Runtime's headers on the include path ONNX Runtime runs the network; without them, or with
-// MGCA_USE_OPENCV_DNN defined, cv::dnn of OpenCV 5 does (the one of OpenCV 4 cannot run this graph).
+// The model file: what a caller of its network has to know, read from its metadata.
 
 #pragma once
 
 #include <opencv2/core.hpp>
-
-#if !defined(MGCA_USE_OPENCV_DNN)
-#if __has_include(<onnxruntime_cxx_api.h>)
-#include <onnxruntime_cxx_api.h>
-#else
-#define MGCA_USE_OPENCV_DNN
-#endif
-#endif
-#if defined(MGCA_USE_OPENCV_DNN)
-#if CV_VERSION_MAJOR < 5
-#error "mgca: no ONNX Runtime headers found, and cv::dnn of OpenCV 4 cannot run the model: add ONNX Runtime or OpenCV 5"
-#endif
-#include <opencv2/dnn.hpp>
-#endif
 
 #include <algorithm>
 #include <array>
@@ -31,18 +14,16 @@
 #include <iterator>
 #include <locale>
 #include <map>
-#include <mutex>
 #include <sstream>
 #include <stdexcept>
 #include <string>
 #include <string_view>
-#include <utility>
 #include <vector>
 
 namespace mgca {
 
 /// Number of values that describe a match beyond its position.
-constexpr int kAttributeCount = 8;
+constexpr std::size_t kAttributeCount = 8;
 
 /// Attributes of one match, raw physical values: ratio d1 / d2, best of the list (0/1), log2(size2 / size1), cosine and
 /// sine of angle2 - angle1, then three flags (0/1): ratio known, best known, size and angle known. Unknown is zero.
@@ -66,7 +47,7 @@ struct AttributePrior {
         double sum = bias2;
         for (std::size_t unit = 0; unit < weight1.size(); ++unit) {
             double x = bias1[unit];
-            for (int i = 0; i < kAttributeCount; ++i) {
+            for (std::size_t i = 0; i < kAttributeCount; ++i) {
                 x += weight1[unit][i] * attributes[i];
             }
             sum += weight2[unit] * 0.5 * x * (1.0 + std::erf(x / std::sqrt(2.0)));
@@ -261,108 +242,5 @@ inline ModelMetadata read_metadata(const std::filesystem::path& file) {
         throw ModelError(file, "metadata '" + key + "' cannot be read (" + error.what() + ")");
     }
 }
-
-/// The network: matches of one pair in, one logit for each out. Safe to use from several threads.
-class Network {
-public:
-    /// Throws ModelError where the runtime cannot open the file.
-    explicit Network(const std::filesystem::path& file);
-
-    Network(const Network&) = delete;
-    Network& operator=(const Network&) = delete;
-
-    /// One forward pass over the N >= 1 matches of a pair.
-    ///
-    /// @param correspondences N rows of x1, y1, x2, y2 on the normalised image planes, finite.
-    /// @param attributes N rows of Attributes.
-    /// @return N logits; not finite where the input is degenerate (all points equal, say).
-    ///
-    /// Throws the runtime's exception (Ort::Exception or cv::Exception) where it fails, for lack of memory, say.
-    std::vector<float> infer(std::vector<float> correspondences, std::vector<float> attributes) const;
-
-    /// Name and version of the runtime.
-    static std::string runtime();
-
-private:
-#if defined(MGCA_USE_OPENCV_DNN)
-    mutable std::mutex mutex_;  // a cv::dnn::Net keeps its blobs between calls
-    mutable cv::dnn::Net net_;
-#else
-    // The session must not outlive the environment: members are destroyed in reverse order.
-    Ort::Env environment_;
-    mutable Ort::Session session_;  // its Run is thread-safe, but not declared const
-#endif
-};
-
-#if defined(MGCA_USE_OPENCV_DNN)
-
-inline Network::Network(const std::filesystem::path& file) {
-    try {
-        net_ = cv::dnn::readNetFromONNX(file.string(), cv::dnn::ENGINE_NEW);
-    } catch (const cv::Exception& error) {
-        throw ModelError(file, std::string("OpenCV cannot open the model (") + error.what() + ")");
-    }
-}
-
-inline std::vector<float> Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
-    const int count = static_cast<int>(attributes.size()) / kAttributeCount;
-    const std::array<int, 3> shape1{1, count, 4}, shape2{1, count, kAttributeCount};
-    const std::lock_guard<std::mutex> lock(mutex_);
-    net_.setInput(cv::Mat(3, shape1.data(), CV_32F, correspondences.data()), "correspondences");
-    net_.setInput(cv::Mat(3, shape2.data(), CV_32F, attributes.data()), "attributes");
-    const cv::Mat logits = net_.forward("logits");
-    return {logits.ptr<float>(), logits.ptr<float>() + count};
-}
-
-inline std::string Network::runtime() { return std::string("cv::dnn ") + CV_VERSION; }
-
-#else
-
-namespace detail {
-
-/// Throws std::runtime_error where the library is older than the headers, which ONNX Runtime answers with a crash.
-inline Ort::Env make_environment() {
-    if (OrtGetApiBase()->GetApi(ORT_API_VERSION) == nullptr) {
-        throw std::runtime_error(std::string("ONNX Runtime's library (") + OrtGetApiBase()->GetVersionString() +
-                                 ") is older than its headers (1." + std::to_string(ORT_API_VERSION) + ")");
-    }
-    return Ort::Env(ORT_LOGGING_LEVEL_ERROR, "mgca");
-}
-
-}  // namespace detail
-
-inline Network::Network(const std::filesystem::path& file)
-    : environment_(detail::make_environment()), session_(nullptr) {
-    try {
-        // The place for execution providers and thread counts. The product that this fusion makes rounds by the
-        // number of threads, and a rounding may move logits by tenths; Python leaves it out as well.
-        Ort::SessionOptions options;
-        options.AddConfigEntry("optimization.disable_specified_optimizers", "MatMulScaleFusion");
-        session_ = Ort::Session(environment_, file.c_str(), options);
-    } catch (const Ort::Exception& error) {
-        throw ModelError(file, std::string("ONNX Runtime cannot open the model (") + error.what() + ")");
-    }
-}
-
-inline std::vector<float> Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
-    const auto count = static_cast<std::int64_t>(attributes.size()) / kAttributeCount;
-    const std::array<std::int64_t, 3> shape1{1, count, 4}, shape2{1, count, kAttributeCount};
-    const Ort::MemoryInfo memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
-    const std::array<Ort::Value, 2> inputs{
-        Ort::Value::CreateTensor<float>(memory, correspondences.data(), correspondences.size(), shape1.data(), 3),
-        Ort::Value::CreateTensor<float>(memory, attributes.data(), attributes.size(), shape2.data(), 3)};
-    constexpr std::array<const char*, 2> input_names{"correspondences", "attributes"};
-    constexpr std::array<const char*, 1> output_names{"logits"};
-    const std::vector<Ort::Value> outputs =
-        session_.Run(Ort::RunOptions(), input_names.data(), inputs.data(), inputs.size(), output_names.data(), 1);
-    const float* logits = outputs.front().GetTensorData<float>();
-    return {logits, logits + count};
-}
-
-inline std::string Network::runtime() {
-    return std::string("ONNX Runtime ") + OrtGetApiBase()->GetVersionString();
-}
-
-#endif
 
 }  // namespace mgca
