@@ -149,6 +149,7 @@ def test_batches_are_dynamic(exported):
         np.testing.assert_allclose(alone[0], logits[pair], atol=1e-2)
 
 
+@pytest.mark.slow  # tracing takes five seconds a network; the default form is exported above and below
 @pytest.mark.parametrize(
     ("changes", "counts"),
     [
