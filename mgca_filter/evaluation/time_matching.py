@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -56,13 +58,14 @@ def match_times(names: Sequence[str], like: Method, pairs: Sequence[ScenePair], 
     """
     if not pairs:
         raise ValueError("times cannot be matched: not one pair can be read")
-    depends_on = {"rows": list(names), "like": like.name, "settings": like.settings(), **circumstances(pairs)}
-    matches = store.once("time-matched", depends_on, lambda: [asdict(_search(name, like, pairs)) for name in names])
-    return [TimeMatch(**fields) for fields in matches]
+    target = {"like": like.name, "settings": like.settings(), **circumstances(pairs)}
+    searches = {name: partial(_search, name, like, pairs) for name in names}
+    found = [store.once("time-matched", {"row": name, **target}, search) for name, search in searches.items()]
+    return [TimeMatch(**match) for match in found]
 
 
-def _search(name: str, like: Method, pairs: Sequence[ScenePair]) -> TimeMatch:
-    """Doubles or halves the iterations past the target, then divides the bracket in the logarithm."""
+def _search(name: str, like: Method, pairs: Sequence[ScenePair]) -> dict[str, Any]:
+    """Fields of the match: iterations double or halve past the target, then the bracket is divided in the logarithm."""
     logger.info("%s: looking for the iterations that take as long as %s", name, like.name)
 
     def share(iterations: int) -> float:
@@ -95,4 +98,4 @@ def _search(name: str, like: Method, pairs: Sequence[ScenePair]) -> TimeMatch:
         return round(abs(apart) / TIE) * TIE, -iterations if apart <= 0 else iterations
 
     best = min(tried, key=distance)
-    return TimeMatch(f"{name} {best} iterations", best, like.name, tried[best])
+    return asdict(TimeMatch(f"{name} {best} iterations", best, like.name, tried[best]))
