@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import os
 import pickle
+import signal
 import struct
 import sys
 import types
 import warnings
+import weakref
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +19,8 @@ import pytest
 from conftest import METADATA, build_model
 
 import mgca_filter.backends.torch_backend as torch_backend
-from mgca_filter import BackendError, ModelError, filter_matches
-from mgca_filter.backends import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend
+from mgca_filter import BackendError, ModelError, backends, filter_matches
+from mgca_filter.backends import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend, shared_backend
 from mgca_filter.backends.torch_backend import read_safetensors_metadata
 from mgca_filter.calibration import AttributePrior, Calibration, gelu
 
@@ -250,6 +254,41 @@ def test_no_runtime_at_all_is_a_backend_error(
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(BackendError, match="PyTorch"):
         torch_backend.TorchBackend(weights)
+
+
+def test_torch_without_safetensors_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("torch")
+    for name in [name for name in sys.modules if name.startswith("mgca_filter.network")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    with pytest.raises(BackendError, match="safetensors"):
+        TorchBackend(write_safetensors(tmp_path / "m.safetensors", METADATA))
+
+
+def test_a_file_that_changes_replaces_its_session(tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx")
+    first = shared_backend(path)
+    assert shared_backend(path) is first
+    build_model(path, {**METADATA, "name": "a longer name than before"})
+    second = shared_backend(path)
+    assert second.metadata.name == "a longer name than before"
+    forgotten = weakref.ref(first)
+    del first
+    gc.collect()
+    assert forgotten() is None
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded, use of fork:DeprecationWarning")
+def test_a_child_forked_while_a_model_opens_does_not_wait_for_it(tmp_path: Path) -> None:
+    path = build_model(tmp_path / "m.onnx")
+    with backends._open_lock:
+        child = os.fork()
+        if child == 0:
+            signal.alarm(60)  # ends a child that waits for ever
+            shared_backend(path)
+            os._exit(0)
+    assert os.waitpid(child, 0)[1] == 0
 
 
 @pytest.mark.parametrize(

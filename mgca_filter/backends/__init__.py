@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import warnings
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +19,8 @@ from .torch_backend import TorchBackend
 BACKENDS = ("auto", "onnxruntime", "opencv", "torch")
 _PROBE_MATCHES = 16
 
-_open_backends: dict[tuple[Any, ...], Backend] = {}
+# By path, backend and providers: time and size of the file, and what was opened from it.
+_open_backends: dict[tuple[Path, str, str], tuple[tuple[int, int] | None, Backend]] = {}
 _open_lock = threading.Lock()
 
 __all__ = [
@@ -81,8 +82,19 @@ def shared_backend(path: Path, backend: str = "auto", providers: Providers | Non
     """
     path = path.resolve()
     stamp = (path.stat().st_mtime_ns, path.stat().st_size) if path.is_file() else None
-    key = (path, stamp, backend, repr(providers))
+    key = (path, backend, repr(providers))
     with _open_lock:
-        if key not in _open_backends:
-            _open_backends[key] = open_backend(path, backend, providers)
-        return _open_backends[key]
+        known = _open_backends.get(key)
+        if known is None or known[0] != stamp:
+            known = _open_backends[key] = (stamp, open_backend(path, backend, providers))
+        return known[1]
+
+
+def _renew_lock() -> None:
+    global _open_lock
+    _open_lock = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    # A child forked while another thread opens a model would wait for ever for a thread that it does not have.
+    os.register_at_fork(after_in_child=_renew_lock)

@@ -24,7 +24,7 @@ class TorchBackend:
 
     Raises:
         ModelError: the file is missing, truncated, or of another contract.
-        BackendError: PyTorch is not installed or does not start.
+        BackendError: PyTorch or safetensors is not installed or does not start.
     """
 
     name = "torch"
@@ -35,10 +35,10 @@ class TorchBackend:
         self._metadata = parse_metadata(read_safetensors_metadata(path), path)
         try:
             import torch
-        except Exception as error:  # a broken installation raises whatever its loader raises
-            raise BackendError(f"PyTorch cannot be imported ({error})") from error
-        from ..network import load_network
 
+            from ..network import load_network
+        except Exception as error:  # a broken installation raises whatever its loader raises
+            raise BackendError(f"PyTorch or safetensors cannot be imported ({error})") from error
         self._torch: Any = torch
         self._network: Any = load_network(path).eval()
 
