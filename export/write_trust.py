@@ -22,25 +22,29 @@ from mgca_filter.evaluation import detectors, focal_error, never_worse, score_pr
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "trust.md"
+PER_SCENE = 24
+"""Pairs of a scene in every study that draws."""
+
 Study = Callable[[Sequence[str]], int]
 
 
 def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
     """By the name of their place in the page: the command and its arguments."""
     bundles, photos, store = str(options.bundles), str(options.photos), str(options.store)
+    each = ["--per-scene", str(PER_SCENE)]
     scenes = [word for pair in options.scene for word in ("--scene", *pair)]
     return {
         "stress": (stress.main, []),
         "verdicts": (
             verdicts.main,
-            [photos, "--same-place", str(options.same_place), "--bundles", bundles, "--store", store],
+            [photos, "--same-place", str(options.same_place), "--bundles", bundles, *each, "--store", store],
         ),
-        "scores": (score_promise.main, [bundles, "--per-scene", "40"]),
+        "scores": (score_promise.main, [bundles, *each]),
         "never_worse": (
             never_worse.main,
-            [bundles, str(options.rendered), "--per-scene", "40", "--store", store],
+            [bundles, str(options.rendered), *each, "--store", store],
         ),
-        "focal": (focal_error.main, [bundles, "--per-scene", "40"]),
+        "focal": (focal_error.main, [bundles, *each]),
         "detectors": (detectors.main, [*scenes, "--rendered", photos]),
     }
 

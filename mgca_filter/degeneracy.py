@@ -24,10 +24,10 @@ from .homography import homography_distance
 
 Array = NDArray[np.float64]
 
-MIN_SUPPORT = 15
+MIN_SUPPORT = 13
 # Number of false alarms, log10: above the first the support is chance, above the second it is weak.
 UNRELATED_LOG10_NFA = 0.5
-LOW_SUPPORT_LOG10_NFA = -3.0
+LOW_SUPPORT_LOG10_NFA = -1.0
 EXPLAINED_SHARE = 0.95
 EXPLAINED_THRESHOLD_FACTOR = 2.0
 MAX_ACCIDENTAL_SHARE = 0.3
