@@ -58,7 +58,10 @@ def section(summary: dict[str, Any]) -> str:
     versions = summary["versions"]
     timing = summary["timing"]
     caution = " The machine was busy with other work: times are rough." if timing["others_load"] > BUSY_LOAD else ""
-    matched = " Rows with a number of iterations got as much time as the filter." if summary["time_matched"] else ""
+    matched, command = "", "python -m mgca_filter.evaluation BUNDLES"
+    if summary["time_matched"]:
+        matched = " Rows with a number of iterations got as much time as the filter, as far as they would take it."
+        command += " --time-matched product"
     lines = [
         f"Validation: all {pairs} pairs of {len(scenes)} scenes that training never saw; {raw_share:.0f} % of a pair's "
         "raw SIFT matches lie near the true epipolar line. Mean over scenes, per cent; a pair without a pose counts as "
@@ -74,7 +77,7 @@ def section(summary: dict[str, Any]) -> str:
         "",
         f"OpenCV {versions.get('opencv-contrib-python-headless', '?')}, {summary['machine'].get('processor', 'CPU')}."
         f"{caution} "
-        "Command: `python -m mgca_filter.evaluation BUNDLES`; figures with bootstrap intervals, by scene: "
+        f"Command: `{command}`; figures with bootstrap intervals, by scene: "
         "`docs/scoreboard.json`; curves and a picture: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
         "",
     ]

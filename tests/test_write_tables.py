@@ -25,7 +25,9 @@ SUMMARY = {
 def test_rows_of_equal_time_are_explained():
     script = load_export_module("write_tables")
     assert "as much time as the filter" not in script.section(SUMMARY)
-    assert "as much time as the filter" in script.section({**SUMMARY, "time_matched": [{"method": "x"}]})
+    matched = script.section({**SUMMARY, "time_matched": [{"method": "x"}]})
+    assert "as much time as the filter" in matched
+    assert "`python -m mgca_filter.evaluation BUNDLES --time-matched product`" in matched
 
 
 def test_tables_and_figures_are_written(tmp_path: Path):
