@@ -141,6 +141,19 @@ def test_sums_before_layer_norm_and_gelu_escape_fusion() -> None:
     assert (operators["Sum"], operators["Add"]) == (2, 1)
 
 
+def test_tensors_are_numbered_and_nodes_keep_their_names() -> None:
+    half = np.array(0.5, np.float32)
+    nodes = [
+        helper.make_node("Mul", ["x", "a factor"], ["a product"], "scale"),
+        helper.make_node("Add", ["a product", "x"], ["y"], "sum"),
+    ]
+    simplified, _ = check(build(nodes, {"a factor": half}))
+    assert [(item.name, list(item.input), list(item.output)) for item in simplified.graph.node] == [
+        ("scale", ["x", "t0"], ["t1"]),
+        ("sum", ["t1", "x"], ["y"]),
+    ]
+
+
 def test_the_shipped_graph_has_no_sizes_left_to_compute() -> None:
     operators = Counter(node.op_type for node in onnx.load(str(mgca_filter.model_path())).graph.node)
     assert operators["Shape"] == 1
