@@ -31,13 +31,14 @@ Study = Callable[[Sequence[str]], int]
 def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
     """By the name of their place in the page: the command and its arguments."""
     bundles, photos, store = str(options.bundles), str(options.photos), str(options.store)
+    places = ["--same-place", str(options.same_place)]
     each = ["--per-scene", str(PER_SCENE)]
     scenes = [word for pair in options.scene for word in ("--scene", *pair)]
     return {
         "stress": (stress.main, []),
         "verdicts": (
             verdicts.main,
-            [photos, "--same-place", str(options.same_place), "--bundles", bundles, *each, "--store", store],
+            [photos, "--pairs", "1000", *places, "--bundles", bundles, *each, "--store", store],
         ),
         "scores": (score_promise.main, [bundles, *each]),
         "never_worse": (
