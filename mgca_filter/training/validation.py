@@ -59,7 +59,8 @@ class PairFigures:
     """A network on one pair and one kind of input of M matches.
 
     Attributes:
-        logits: (M,) float64; matches that never enter the network have the prior's, or −inf without a prior.
+        logits: (M,) float64; matches that never enter the network have the prior's, and never above 0, or −inf without
+            a prior.
         truth: (M,) bool, within 1e-4 of the true epipolar geometry.
         fit_deg, own_deg: pose error of the robust fit, and of the network's essential matrix alone.
     """
@@ -108,7 +109,7 @@ def evaluate_pair(network: MGCANet, pair: ScenePair, given: InputList | None = N
     output = network(torch.from_numpy(x.astype(np.float32))[None].to(device), known[rows][None])
     logits = np.full(len(taken), -np.inf)
     if network.prior is not None:
-        logits = network.prior(known).double().cpu().numpy()
+        logits = np.minimum(network.prior(known).double().cpu().numpy(), 0.0)  # rejected, as in the filter
     entered = output.logits[0].double().cpu().numpy()
     logits[rows] = entered
     order = match_order(entered, encoded[rows, 0], encoded[rows, 5] > 0)

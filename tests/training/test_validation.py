@@ -11,6 +11,8 @@ from networks import tiny_network
 from scene_bundles import write_bundle
 
 from mgca_filter import MatchFilter, match_filter
+from mgca_filter.correspondences import candidate_mask
+from mgca_filter.evaluation.metrics import precision_recall_f
 from mgca_filter.network import save_network
 from mgca_filter.onnx_export import ModelDescription, model_metadata
 from mgca_filter.scene_bundle import SceneBundle
@@ -32,3 +34,15 @@ def test_matches_are_ranked_as_the_filter_ranks_them(tmp_path: Path, monkeypatch
     np.testing.assert_array_equal(validated.correspondences, filtered.correspondences)
     np.testing.assert_allclose(validated.margins, filtered.margins, atol=1e-6)
     np.testing.assert_allclose(validated.weights, filtered.weights, atol=1e-6)
+
+
+def test_matches_that_never_enter_the_network_are_rejected(tmp_path: Path) -> None:
+    network = tiny_network(seed=2)
+    assert network.prior is not None
+    network.prior.output.bias.data.fill_(5.0)  # a prior that would accept everything
+    pair = SceneBundle(write_bundle(tmp_path / "hall.npz", [make_scene(right=100, wrong=400)]))[0]
+    entered = candidate_mask(pair.attributes.encode(len(pair.points1)))
+    assert 0 < np.count_nonzero(~entered) < len(entered)
+    figures = validation.evaluate_pair(network, pair)
+    assert (figures.logits[~entered] <= 0).all()
+    assert figures.at(0.0) == precision_recall_f(entered & (figures.logits > 0), figures.truth)
