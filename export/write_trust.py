@@ -23,7 +23,7 @@ from mgca_filter.evaluation import detectors, focal_error, never_worse, score_pr
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = ROOT / "docs" / "trust.md"
 PER_SCENE = 24
-"""Pairs of a scene in every study that draws."""
+"""Pairs of a scene in the studies that draw from the bundles."""
 
 Study = Callable[[Sequence[str]], int]
 
@@ -38,7 +38,7 @@ def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
         "stress": (stress.main, []),
         "verdicts": (
             verdicts.main,
-            [photos, "--pairs", "1000", *places, "--bundles", bundles, *each, "--store", store],
+            [photos, "--pairs", "1000", *places, "--bundles", bundles, "--store", store],
         ),
         "scores": (score_promise.main, [bundles, *each]),
         "never_worse": (
