@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import mgca_filter
+from mgca_filter import FilterResult
 from mgca_filter.backends import OnnxBackend
 from mgca_filter.epipolar import pose_error_deg
 from mgca_filter.matching import match_descriptors
@@ -115,8 +116,10 @@ def run_program(program: Path, pair: Pair, model: Path, folder: Path, *options: 
     return answer
 
 
-def assert_same_answer(program: Path, pair: Pair, model: Path, folder: Path, **options: Any) -> dict[str, Any]:
-    """Scores, masks and pose of the C++ program against those of Python; the answer."""
+def assert_same_scores(
+    program: Path, pair: Pair, model: Path, folder: Path, **options: Any
+) -> tuple[dict[str, Any], FilterResult]:
+    """Scores and network mask of the C++ program against those of Python; both answers."""
     words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
     answer = run_program(program, pair, model, folder, *words)
     expected = mgca_filter.filter_matches(
@@ -127,6 +130,12 @@ def assert_same_answer(program: Path, pair: Pair, model: Path, folder: Path, **o
     np.testing.assert_allclose(answer["logits"], logits, atol=1e-3)
     np.testing.assert_allclose(answer["scores"], expected.scores, atol=1e-3)
     np.testing.assert_array_equal(np.array(answer["network_mask"], bool), logits > threshold)
+    return answer, expected
+
+
+def assert_same_answer(program: Path, pair: Pair, model: Path, folder: Path, **options: Any) -> dict[str, Any]:
+    """Scores, masks and pose of the C++ program against those of Python; the answer."""
+    answer, expected = assert_same_scores(program, pair, model, folder, **options)
     mask = np.array(answer["mask"], bool)
     union = np.count_nonzero(mask | expected.mask)
     assert expected.num_inliers > 30

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import combinations
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ from cpp_program import (
     SOURCE,
     Pair,
     assert_same_answer,
+    assert_same_scores,
     build,
     build_program,
     comma_separated,
@@ -111,11 +113,13 @@ def test_rule_calibration_prior_and_threshold_come_from_the_file(program, small,
     assert_same_answer(program, small, build_model(tmp_path / "other.onnx", metadata), tmp_path)
 
 
-@pytest.mark.parametrize(("first", "second"), [(0, 1), (1, 3), (2, 3)])
-def test_rendered_views_get_the_answer_of_python(program, views, tmp_path, first, second):
+@pytest.mark.parametrize(("first", "second"), list(combinations(range(4), 2)))
+def test_rendered_views_get_the_pose_of_python(program, views, tmp_path, first, second):
     a, b = views[first], views[second]
     pair = nearest_neighbours((a.keypoints, a.descriptors), (b.keypoints, b.descriptors), a.K)
-    assert_same_answer(program, pair, mgca_filter.model_path(), tmp_path)
+    answer, expected = assert_same_scores(program, pair, mgca_filter.model_path(), tmp_path)
+    # Wide pairs with few matches: another version of OpenCV, or another seed, moves the pose by a third of a degree.
+    assert pose_error_deg(answer["R"], answer["t"], expected.R, expected.t) < 1.0
 
 
 # Little to go on

@@ -149,7 +149,7 @@ def test_degenerate_points_do_not_raise(method: str, calibrated: bool) -> None:
 
 def test_poselib_missing_names_the_extra(monkeypatch: pytest.MonkeyPatch, scene: Scene) -> None:
     monkeypatch.setitem(__import__("sys").modules, "poselib", None)
-    with pytest.raises(ImportError, match=r"mgca-filter\[poselib\]"):
+    with pytest.raises(ImportError, match=r"mgca_filter\[poselib\]"):
         estimate_model(by_ratio(scene), FOCAL, RobustFitOptions(method="poselib"))
 
 
