@@ -19,7 +19,8 @@ from .homography import usac_params
 Array = NDArray[np.float64]
 
 METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
-_POSELIB_MIN_ITERATIONS = 1000
+# Behind the network hardly a sample is spoiled: PoseLib's own 1000 buy nothing but time.
+_POSELIB_MIN_ITERATIONS = 50
 # Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
 

@@ -51,8 +51,8 @@ class Start:
 # Estimators stop at the first model that looks good enough and miss better ones; what they see decides which they
 # meet. Up to four views of the matches, and the choice by support, find most of what any one of them would.
 STARTS = (Start(-1.0, 2.0), Start(-1.0, 1.0), Start(0.0, 2.0), Start(-2.0, 1.0))
-# PoseLib samples more thoroughly and takes longer: two are enough.
-POSELIB_STARTS = (STARTS[2], STARTS[3])
+# PoseLib samples more thoroughly and takes longer: one is enough.
+POSELIB_STARTS = (STARTS[2],)
 SINGLE_START = (Start(),)
 
 
