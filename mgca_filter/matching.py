@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import cv2
@@ -95,18 +96,23 @@ def _from_dmatch(source: Any, rows: Sequence[Any], count1: int, count2: int, nam
     ):
         i, row = next((i, row) for i, row in enumerate(rows) if not _holds_matches(row))
         raise TypeError(f"{name}[{i}]: expected cv2.DMatch like its neighbours, got {_describe(row)}")
-    present = np.array([len(row) > 0 for row in rows])
-    contested = np.array([len(row) > 1 for row in rows])
+    lengths = np.fromiter(map(len, rows), dtype=np.intp, count=len(rows))
+    present, contested = lengths > 0, lengths > 1
+    first = [row[0] for row in rows if len(row) > 0]
+    second = [row[1] for row in rows if len(row) > 1]
     index1, index2 = np.full(len(rows), -1, dtype=np.intp), np.full(len(rows), -1, dtype=np.intp)
     distance1, distance2 = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    index1[present] = [row[0].queryIdx for row in rows if len(row) > 0]
-    index2[present] = [row[0].trainIdx for row in rows if len(row) > 0]
-    distance1[present] = [row[0].distance for row in rows if len(row) > 0]
-    distance2[contested] = [row[1].distance for row in rows if len(row) > 1]
+    index1[present], index2[present] = _field(first, "queryIdx"), _field(first, "trainIdx")
+    distance1[present], distance2[contested] = _field(first, "distance"), _field(second, "distance")
     _check_range(index1[present], index2[present], count1, count2, name)
     distance1, distance2 = (np.where(np.abs(d) < _NO_DISTANCE, d, np.nan) for d in (distance1, distance2))
     ratio = None if np.isnan(distance2).all() else distance_ratio(distance1, distance2)
     return PutativeMatches(index1, index2, ratio, best_of_list(index2, distance1), source)
+
+
+def _field(matches: Sequence[Any], name: str) -> NDArray[np.float64]:
+    """One field of many ``cv2.DMatch``; indices fit a float exactly."""
+    return np.fromiter(map(attrgetter(name), matches), dtype=np.float64, count=len(matches))
 
 
 def _holds_matches(row: Any) -> bool:
