@@ -58,16 +58,19 @@ def section(summary: dict[str, Any]) -> str:
     versions = summary["versions"]
     timing = summary["timing"]
     caution = " The machine was busy with other work: times are rough." if timing["others_load"] > BUSY_LOAD else ""
-    matched, command = "", "python -m mgca_filter.evaluation BUNDLES"
+    seeds = summary["settings"]["seeds"]
+    averaged = f"averaged over {seeds} seeds" if seeds > 1 else "run once"
+    command = f"python -m mgca_filter.evaluation BUNDLES --seeds {seeds} --times {timed_pairs(summary) // len(scenes)}"
+    matched = ""
     if summary["time_matched"]:
         matched = " Rows with a number of iterations got as much time as the filter, as far as they would take it."
         command += " --time-matched product"
     lines = [
         f"Validation: all {pairs} pairs of {len(scenes)} scenes that training never saw; {raw_share:.0f} % of a pair's "
         "raw SIFT matches lie near the true epipolar line. Mean over scenes, per cent; a pair without a pose counts as "
-        "180°. P, R, F: the decision before the robust fit (ours: logit > 0), over all raw matches. ms: median over "
-        f"{timed_pairs(summary)} pairs, all rows in turn on each, one thread. Rivals run at the threshold that suits "
-        f"each best.{matched}",
+        f"180°. Estimators that take a seed are {averaged}. P, R, F: the decision before the robust fit (ours: logit "
+        f"> 0), over all raw matches. ms: median over {timed_pairs(summary)} pairs, all rows in turn on each, one "
+        f"thread. Rivals run at the threshold that suits each best.{matched}",
         "",
         *table(rows, "all", COLUMNS),
         "",

@@ -18,6 +18,7 @@ SUMMARY = {
     "versions": {"opencv-contrib-python-headless": "5.0.0"},
     "machine": {"processor": "Abacus"},
     "time_matched": [],
+    "settings": {"seeds": 3},
     "timing": {"machine": "Abacus", "others_load": 0.0},
 }
 
@@ -27,7 +28,15 @@ def test_rows_of_equal_time_are_explained():
     assert "as much time as the filter" not in script.section(SUMMARY)
     matched = script.section({**SUMMARY, "time_matched": [{"method": "x"}]})
     assert "as much time as the filter" in matched
-    assert "`python -m mgca_filter.evaluation BUNDLES --time-matched product`" in matched
+    assert "`python -m mgca_filter.evaluation BUNDLES --seeds 3 --times 2 --time-matched product`" in matched
+
+
+def test_seeds_are_told():
+    script = load_export_module("write_tables")
+    assert "averaged over 3 seeds" in script.section(SUMMARY)
+    once = script.section({**SUMMARY, "settings": {"seeds": 1}})
+    assert "run once" in once
+    assert "--seeds 1 " in once
 
 
 def test_tables_and_figures_are_written(tmp_path: Path):
