@@ -267,12 +267,13 @@ def test_data_never_raises(twin: Callable, points: np.ndarray) -> None:
         assert mask.dtype == np.uint8
 
 
-def test_outliers_alone_seldom_pass() -> None:
+def test_only_outliers_keep_nothing() -> None:
     draws = [np.random.default_rng(seed).uniform(0, 600, (2, 300, 2)) for seed in range(20)]
-    for twin in TWINS.values():
-        answers = [twin(*points) for points in draws]
-        assert sum(M is not None for M, _ in answers) <= 3  # one in ten: F of bare points is not told from chance
-        assert not any(mask.any() for M, mask in answers if M is None)
+    answers = {name: [twin(*points) for points in draws] for name, twin in TWINS.items()}
+    assert all(E is None for E, _ in answers["E"])
+    # Without intrinsics chance fits better: of uniformly random points one F in ten passes.
+    assert sum(F is not None for F, _ in answers["F"]) <= 2
+    assert not any(mask.any() for M, mask in answers["E"] + answers["F"] if M is None)
 
 
 def test_twenty_thousand_points() -> None:
