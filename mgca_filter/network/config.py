@@ -26,6 +26,8 @@ class NetworkConfig:
         final_consensus: consensus over the outputs of all stages, whose heads give the answer.
         pooled_branches: the average- and max-pooled branches of MB-FFN.
         squeeze_excitation: channel gates of the consensus blocks.
+        refined_feedback: the third stage sees the residuals of the second stage's essential matrix refined on its
+            manifold, and sees them finer; the paper has the eight-point algorithm's.
         attributes: side information of the matches as input and as a prior on the logits.
     """
 
@@ -41,6 +43,7 @@ class NetworkConfig:
     final_consensus: bool = True
     pooled_branches: bool = True
     squeeze_excitation: bool = True
+    refined_feedback: bool = False
     attributes: bool = True
 
     def __post_init__(self) -> None:
@@ -94,6 +97,6 @@ class NetworkConfig:
 
 
 PRESETS = {
-    "small": NetworkConfig(),
+    "small": NetworkConfig(refined_feedback=True),
     "paper": NetworkConfig(channels=128, clusters=500, stages=3, graph_expansion=2),
 }

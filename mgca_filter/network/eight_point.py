@@ -79,11 +79,12 @@ def symmetric_epipolar_distance_squared(correspondences: Tensor, E: Tensor) -> T
     return error.square() * (1.0 / (n2 + 1e-15) + 1.0 / (n1 + 1e-15))
 
 
-def residual_channel(correspondences: Tensor, E: Tensor) -> Tensor:
-    """Epipolar residual (B, N) as the next stage sees it: log10 of distance² over the label's 1e-4, −1 … 1.5.
+def residual_channel(correspondences: Tensor, E: Tensor, floor: float = 1e-2) -> Tensor:
+    """Epipolar residual (B, N) as the next stage sees it: half of log10 of distance² over the label's 1e-4, at most 1.5.
 
-    The published code feeds the bare residual; right and wrong matches differ by factors, hence the logarithm.
-    Its floor lies at a tenth of the label's distance: finer, and rounding errors of E would decide.
+    The published code feeds the bare residual; right and wrong matches differ by factors, hence the logarithm. Its
+    ``floor`` (distance² over 1e-4) is a tenth of the label's distance by default: finer, and the rounding errors of the
+    eight-point algorithm would decide.
     """
     distance = symmetric_epipolar_distance_squared(correspondences, E) / LABEL_DISTANCE
-    return torch.log10(distance + 1e-2).clamp_max(3.0) * 0.5
+    return torch.log10(distance + floor).clamp_max(3.0) * 0.5

@@ -18,6 +18,9 @@ from .order_aware import OrderAwareBlock
 from .point_cn import PointCN
 
 PRIOR_HIDDEN = 16
+# Only scores that have seen a geometry once lead its refinement nearer to the truth more often than away from it.
+FIRST_REFINED_STAGE = 2
+REFINED_FLOOR = 1e-3  # of the residual: about a quarter of a pixel
 MINIMUM_CONSENSUS = 8  # fewer matches fit any geometry: the prior alone speaks
 
 
@@ -178,8 +181,9 @@ class MGCANet(nn.Module):
         inputs = [correspondences, attributes] if self.prior is not None else [correspondences]
         heads: list[HeadOutput] = []
         features: list[StageFeatures] = []
-        for stage, head in zip(self.stages, self.heads, strict=True):
-            channels = inputs + (self._feedback(correspondences, heads[-1]) if heads else [])
+        for number, (stage, head) in enumerate(zip(self.stages, self.heads, strict=True)):
+            refined = self.config.refined_feedback and number >= FIRST_REFINED_STAGE
+            channels = inputs + (self._feedback(correspondences, heads[-1], refined) if heads else [])
             features.append(stage(torch.cat(channels, -1), correspondences, features))
             heads.append(head(features[-1].output, prior, correspondences))
         if self.final is not None:
@@ -191,9 +195,13 @@ class MGCANet(nn.Module):
         return NetworkOutput(heads[-1].logits, essential, heads)
 
     @staticmethod
-    def _feedback(correspondences: Tensor, previous: HeadOutput) -> list[Tensor]:
+    def _feedback(correspondences: Tensor, previous: HeadOutput, refined: bool) -> list[Tensor]:
         logits, essential = previous.logits.detach(), previous.essential.detach()
         with torch.autocast(logits.device.type, enabled=False):
-            residual = residual_channel(correspondences, essential)  # (B, N)
+            if refined:
+                essential = refine_essential(correspondences, logits, essential)
+                residual = residual_channel(correspondences, essential, REFINED_FLOOR)
+            else:
+                residual = residual_channel(correspondences, essential)  # (B, N)
         enough = (match_count(logits) >= MINIMUM_POINTS).to(residual.dtype)
         return [(residual * enough).unsqueeze(-1), F.relu(torch.tanh(logits)).unsqueeze(-1)]

@@ -64,9 +64,9 @@ def transfer_weights(source: MGCANet, target: MGCANet) -> None:
     with equal weights.
 
     Raises:
-        ValueError: the networks differ in more than their stages.
+        ValueError: the networks differ in more than their stages and what is fed back.
     """
-    same = replace(source.config, stages=target.config.stages)
+    same = replace(source.config, stages=target.config.stages, refined_feedback=target.config.refined_feedback)
     if same != target.config or source.config.stages > target.config.stages:
         raise ValueError(f"weights of {source.config} are no start for {target.config}")
     known = source.state_dict()

@@ -159,3 +159,4 @@ def test_residual_channel_tells_distances_on_a_log_scale():
     on_label = torch.tensor([[[0.0, 0.0, 0.3, (0.5e-4) ** 0.5]]])
     torch.testing.assert_close(residual_channel(on_label, flat), torch.tensor([[0.0]]), atol=0.01, rtol=0)
     torch.testing.assert_close(residual_channel(torch.zeros(1, 1, 4), flat), torch.tensor([[-1.0]]))
+    torch.testing.assert_close(residual_channel(torch.zeros(1, 1, 4), flat, 1e-3), torch.tensor([[-1.5]]))

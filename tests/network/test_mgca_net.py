@@ -12,7 +12,7 @@ from torch import Tensor
 from mgca_filter.network import PRESETS, MGCANet, NetworkConfig
 from mgca_filter.network.eight_point import residual_channel
 from mgca_filter.network.essential_refinement import refine_essential
-from mgca_filter.network.mgca_net import Head, better_half
+from mgca_filter.network.mgca_net import REFINED_FLOOR, Head, better_half
 from mgca_filter.network.weights import count_parameters
 
 FULL = dataclasses.replace(TINY, stages=3)
@@ -29,6 +29,7 @@ SWITCHES = {
     "final_consensus": False,
     "pooled_branches": False,
     "squeeze_excitation": False,
+    "refined_feedback": True,
     "attributes": False,
 }
 
@@ -224,6 +225,20 @@ def test_feedback_of_a_stage_is_cut_from_the_gradient(network):
     assert not seen[0].requires_grad
     assert (seen[1][..., 12] == 0).all()  # below 16 matches E is arbitrary
     assert (seen[0][..., 12] != 0).any()
+
+
+def test_refined_feedback_shows_the_third_stage_residuals_of_the_refined_geometry():
+    network = tiny_network(dataclasses.replace(FULL, refined_feedback=True))
+    seen: list[Tensor] = []
+    for stage in network.stages:
+        stage.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    correspondences, attributes = two_view_batch(40)
+    first, second = network(correspondences, attributes).heads[:2]
+    torch.testing.assert_close(seen[1][..., 12], residual_channel(correspondences, first.essential))
+    refined = refine_essential(correspondences, second.logits, second.essential)
+    torch.testing.assert_close(seen[2][..., 12], residual_channel(correspondences, refined, REFINED_FLOOR))
+    assert sign_free_difference(refined, second.essential) > 1e-3
+    assert not seen[2].requires_grad
 
 
 @pytest.mark.parametrize(("count", "kept"), [(1, 1), (9, 9), (16, 16), (31, 16), (32, 16), (33, 17), (100, 50)])

@@ -123,6 +123,14 @@ def test_a_further_stage_starts_as_a_copy_and_leaves_the_others_alone():
     assert torch.equal(wider, narrow)
 
 
+def test_weights_may_go_on_with_other_feedback():
+    source = tiny_network(dataclasses.replace(TINY, stages=3))
+    target = MGCANet(dataclasses.replace(source.config, refined_feedback=True))
+    transfer_weights(source, target)
+    for mine, given in zip(target.state_dict().values(), source.state_dict().values(), strict=True):
+        assert torch.equal(mine, given)
+
+
 @pytest.mark.parametrize("change", [{"channels": 12}, {"stages": 1}, {"neighbours": 9}])
 def test_weights_of_another_network_are_no_start(change):
     with pytest.raises(ValueError, match="no start"):
