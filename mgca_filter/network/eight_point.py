@@ -80,7 +80,7 @@ def symmetric_epipolar_distance_squared(correspondences: Tensor, E: Tensor) -> T
 
 
 def residual_channel(correspondences: Tensor, E: Tensor, floor: float = 1e-2) -> Tensor:
-    """Epipolar residual (B, N) as the next stage sees it: half of log10 of distance² over the label's 1e-4, at most 1.5.
+    """Epipolar residual (B, N) as the next stage sees it: half of log10 of distance² over the label's 1e-4, up to 1.5.
 
     The published code feeds the bare residual; right and wrong matches differ by factors, hence the logarithm. Its
     ``floor`` (distance² over 1e-4) is a tenth of the label's distance by default: finer, and the rounding errors of the
