@@ -166,18 +166,14 @@ def test_normalised_points_give_what_pixels_give(scene: Scene) -> None:
 
 @pytest.fixture(scope="module")
 def hard() -> Scene:
-    return make_scene(right=60, wrong=140, noise_px=0.8)
+    return make_scene(right=60, wrong=140, noise_px=0.8, seed=1)  # not solved by the first sample
 
 
 @pytest.mark.parametrize("options", [{"method": cv2.USAC_MAGSAC}, {"prob": 0.01}, {"maxIters": 1}], ids=str)
-def test_every_argument_of_the_fit_counts(options: dict) -> None:
-    """On some pair at least: where the first sample is right, no other setting finds anything else."""
-
-    def answers(**changes: Any) -> list[np.ndarray | None]:
-        scenes = [make_scene(right=60, wrong=140, noise_px=0.8, seed=seed) for seed in range(4)]
-        return [findEssentialMat(scene.points1, scene.points2, K, **changes)[0] for scene in scenes]
-
-    assert not all(np.array_equal(E, other) for E, other in zip(answers(), answers(**options)))
+def test_every_argument_of_the_fit_counts(hard: Scene, options: dict) -> None:
+    E, _ = findEssentialMat(hard.points1, hard.points2, K)
+    other, _ = findEssentialMat(hard.points1, hard.points2, K, **options)
+    assert other is None or not np.array_equal(E, other)
 
 
 def test_parameters_of_usac_count(hard: Scene) -> None:

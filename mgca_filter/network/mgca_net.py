@@ -181,8 +181,8 @@ class MGCANet(nn.Module):
         inputs = [correspondences, attributes] if self.prior is not None else [correspondences]
         heads: list[HeadOutput] = []
         features: list[StageFeatures] = []
-        for number, (stage, head) in enumerate(zip(self.stages, self.heads, strict=True)):
-            refined = self.config.refined_feedback and number >= FIRST_REFINED_STAGE
+        for stage, head in zip(self.stages, self.heads, strict=True):
+            refined = self.config.refined_feedback and len(heads) >= FIRST_REFINED_STAGE
             channels = inputs + (self._feedback(correspondences, heads[-1], refined) if heads else [])
             features.append(stage(torch.cat(channels, -1), correspondences, features))
             heads.append(head(features[-1].output, prior, correspondences))
