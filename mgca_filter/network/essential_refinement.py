@@ -7,6 +7,8 @@ weighted by their logits and by a Geman–McClure kernel that narrows from step 
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -17,7 +19,7 @@ from .eight_point import smallest_eigenvector
 # Widths of the kernel, normalised coordinates; the last is about a pixel.
 KERNEL_WIDTHS = (0.1, 0.052, 0.027, 0.014, 0.0072, 0.0037, 0.0019, 0.001)
 # A match counts half at this logit: doubtful ones cost more than they bring.
-WEIGHT_LOGIT = 2.0
+WEIGHT_LOGIT = 3.0
 ORTHONORMALISATIONS = 12
 DAMPING = 1e-6
 _NEXT, _LAST = (1, 2, 0), (2, 0, 1)
@@ -30,6 +32,9 @@ _CROSS = np.array(
 def refine_essential(correspondences: Tensor, logits: Tensor, essential: Tensor) -> Tensor:
     """Essential matrices (B, 3, 3) of unit Frobenius norm and two equal singular values, sign free.
 
+    Gradients reach the logits through the last step alone, taken as if the pose before it were a constant: where the
+    steps have converged that is the derivative of the minimum (implicit differentiation), at the price of one step.
+
     Args:
         correspondences: (B, N, 4) on the normalised image planes.
         logits: (B, N) of the matches.
@@ -40,9 +45,13 @@ def refine_essential(correspondences: Tensor, logits: Tensor, essential: Tensor)
     x2 = torch.cat([correspondences[..., 2:], one], -1)
     weights = torch.sigmoid(logits - WEIGHT_LOGIT)
     weights = (weights / weights.sum(1, keepdim=True).clamp_min(1e-12)).unsqueeze(-1)  # (B, N, 1)
-    R, t = _decompose(essential)
-    for width in KERNEL_WIDTHS:
-        R, t = _step(x1, x2, weights, R, t, width)
+    if weights.requires_grad:
+        # Degenerate matches teach nothing.
+        weights.register_hook(partial(torch.nan_to_num, nan=0.0, posinf=0.0, neginf=0.0))
+    R, t = _decompose(essential.detach())
+    for width in KERNEL_WIDTHS[:-1]:
+        R, t = _step(x1, x2, weights.detach(), R, t, width)
+    R, t = _step(x1, x2, weights, R, t, KERNEL_WIDTHS[-1])
     refined = _cross_matrix(t) @ R
     squared_norm = refined.square().sum((1, 2), keepdim=True)
     # Two for a unit translation and a rotation. Degenerate matches may end in what is not a number: never above 1.

@@ -58,6 +58,7 @@ class ScheduleConfig:
         warmup_steps: linear warm-up.
         weight_decay: of matrices; biases and norms have none.
         geometric_weight: weight of the geometric loss, from ``geometric_from`` (a fraction of the steps) on.
+        refined_weight: weight of the loss of the refined essential matrix, likewise.
         prior_weight: weight of the prior's own classification loss on raw matches.
         clip_norm: gradients are clipped to this norm.
         ema_decay: of the running average of the weights, which is what is evaluated and shipped.
@@ -74,6 +75,7 @@ class ScheduleConfig:
     warmup_steps: int = 200
     weight_decay: float = 1e-4
     geometric_weight: float = 0.5
+    refined_weight: float = 0.0
     geometric_from: float = 0.1
     prior_weight: float = 0.2
     clip_norm: float = 1.0

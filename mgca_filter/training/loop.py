@@ -144,11 +144,12 @@ class Trainer:
             group["lr"] = rate
         if not torch.isfinite(batch["correspondences"]).all():  # one NaN would poison the running statistics
             self._stop(batch, "the input holds NaN")
-        geometric = schedule.geometric_weight if self.step >= schedule.geometric_from * schedule.steps else 0.0
+        begun = self.step >= schedule.geometric_from * schedule.steps
+        weights = (schedule.geometric_weight, schedule.refined_weight) if begun else (0.0, 0.0)
         self.network.train()
         with torch.autocast(self.device.type, torch.bfloat16, enabled=schedule.precision == "bf16"):
             output = self.model(batch["correspondences"], batch["attributes"])
-        loss, parts = network_loss(output, batch, geometric)
+        loss, parts = network_loss(output, batch, *weights)
         if self.network.prior is not None:
             prior = self.network.prior(batch["prior_attributes"])
             loss = loss + schedule.prior_weight * balanced_cross_entropy(prior, batch["prior_labels"])

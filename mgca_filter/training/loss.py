@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -10,6 +11,7 @@ from ..network.eight_point import symmetric_epipolar_distance_squared
 from .labels import NEGATIVE, POSITIVE
 
 GEOMETRIC_CLAMP = 0.1
+REFINED_DISTANCE = 1e-4  # squared: about ten pixels, half a degree
 
 
 def balanced_cross_entropy(logits: Tensor, labels: Tensor) -> Tensor:
@@ -33,16 +35,30 @@ def geometric_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
     return (distance.mean(1) * valid).sum() / valid.sum().clamp_min(1.0)
 
 
+def refined_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
+    """Mean log(1 + d² / 1e-4) of refined E (B, 3, 3), d² the mean squared distance of virtual points (B, V, 4) to it.
+
+    The logarithm lets a pair that is nearly right teach as much as one that is lost. Pairs with ``valid`` (B,) 0
+    don't count.
+    """
+    distance = symmetric_epipolar_distance_squared(virtual, essential).clamp_max(GEOMETRIC_CLAMP).mean(1)
+    return (torch.log1p(distance / REFINED_DISTANCE) * valid).sum() / valid.sum().clamp_min(1.0)
+
+
 def network_loss(
-    output: NetworkOutput, batch: dict[str, Tensor], geometric_weight: float
+    output: NetworkOutput, batch: dict[str, Tensor], geometric_weight: float, refined_weight: float = 0.0
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Loss summed over all heads, and its parts (of the last head) for the log."""
+    """Loss summed over all heads and the refined answer, and its parts (of the last head) for the log."""
     total = output.logits.new_zeros(())
     for head in output.heads:
         classification = balanced_cross_entropy(head.logits, batch["labels"])
         geometry = geometric_loss(head.essential, batch["virtual"], batch["virtual_valid"])
         total = total + classification + geometric_weight * geometry
-    return total, {"classification": classification.detach(), "geometric": geometry.detach()}
+    refined = refined_loss(output.essential, batch["virtual"], batch["virtual_valid"])
+    if refined_weight:
+        total = total + refined_weight * refined
+    parts = {"classification": classification, "geometric": geometry, "refined": refined}
+    return total, {name: part.detach() for name, part in parts.items()}
 
 
 def precision_recall(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,14 +16,14 @@ from mgca_filter.pose_refinement import rotation_from_vector
 WRONG = 40
 
 
-def noisy_pair(seed: int, flat: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+def noisy_pair(seed: int, flat: bool = False, noise: float = 1e-3) -> tuple[Tensor, Tensor, Tensor]:
     """Correspondences (1, 160, 4) with a pixel of noise, logits (1, 160) that are mostly right, the true E."""
     rng = np.random.default_rng(seed)
     R, t = rotation_from_vector(rng.uniform(-0.3, 0.3, 3)), rng.normal(size=3)
     depth = rng.uniform(5.0, 5.2, 160) if flat else rng.uniform(4, 10, 160)
     X = np.column_stack([rng.uniform(-3, 3, (160, 2)), depth])
     X2 = X @ R.T + t / np.linalg.norm(t)
-    rows = np.hstack([X[:, :2] / X[:, 2:], X2[:, :2] / X2[:, 2:]]) + rng.normal(0, 1e-3, (160, 4))
+    rows = np.hstack([X[:, :2] / X[:, 2:], X2[:, :2] / X2[:, 2:]]) + rng.normal(0, noise, (160, 4))
     rows[:WRONG, 2:] = rng.uniform(-0.7, 0.7, (WRONG, 2))
     logits = rng.normal(4, 1, 160)
     logits[:WRONG] = rng.normal(-4, 1, WRONG)
@@ -86,3 +86,32 @@ def test_degenerate_matches_stay_finite(count: int) -> None:
         for logit in (-100.0, 0.0, 100.0):
             refined = refine_essential(rows, torch.full((1, count), logit), start)
             assert torch.isfinite(refined).all()
+
+
+def test_gradients_are_those_of_the_minimum() -> None:
+    rows, logits, truth = noisy_pair(0, noise=1e-4)
+    clean = torch.arange(rows.shape[1]) >= WRONG
+    rows, logits, truth = rows[:, clean].double(), logits[:, clean].double(), truth.double()
+    direction = torch.from_numpy(np.random.default_rng(1).normal(size=(1, 3, 3)))
+
+    def value(logits: Tensor) -> Tensor:
+        refined = refine_essential(rows, logits, truth)
+        return (refined * direction).sum() * (refined * truth).sum().sign()
+
+    leaf = logits.clone().requires_grad_()
+    value(leaf).backward()
+    assert leaf.grad is not None
+    steps = 1e-4 * torch.eye(logits.shape[1], dtype=torch.float64)
+    differences = torch.stack([(value(logits + step) - value(logits - step)) / 2e-4 for step in steps])
+    similarity = torch.nn.functional.cosine_similarity(leaf.grad[0], differences, dim=0)
+    assert similarity > 0.99
+    assert 0.9 < float(leaf.grad.norm() / differences.norm()) < 1.1
+
+
+@pytest.mark.parametrize("count", [1, 7, 16])
+def test_degenerate_matches_have_finite_gradients(count: int) -> None:
+    for rows in (torch.zeros(1, count, 4), torch.full((1, count, 4), 0.3), torch.full((1, count, 4), 1e6)):
+        logits = torch.zeros(1, count, requires_grad=True)
+        refine_essential(rows, logits, torch.eye(3)[None]).square().sum().backward()
+        assert logits.grad is not None
+        assert torch.isfinite(logits.grad).all()

@@ -11,10 +11,12 @@ from networks import TINY, two_view_batch
 from mgca_filter.network import HeadOutput, MGCANet, NetworkOutput
 from mgca_filter.training.loss import (
     GEOMETRIC_CLAMP,
+    REFINED_DISTANCE,
     balanced_cross_entropy,
     geometric_loss,
     network_loss,
     precision_recall,
+    refined_loss,
 )
 
 ROWS = torch.tensor([[[0.0, 0, 0], [0, 0, -1], [0, 1, 0]]])  # epipolar lines are the rows of the images
@@ -66,18 +68,32 @@ def test_geometric_loss_ignores_the_sign_of_e():
     torch.testing.assert_close(geometric_loss(E, virtual, torch.ones(1)), geometric_loss(-E, virtual, torch.ones(1)))
 
 
-@pytest.mark.parametrize("weight", [0.0, 0.5, 2.0])
-def test_all_heads_are_summed(weight):
+def test_refined_loss_is_the_logarithm_of_the_mean_distance_of_valid_pairs():
+    off = 0.01
+    far = [0.0, 0.0, 0.0, 50.0]
+    virtual = torch.tensor([[[0.0, 0.0, 0.3, 0.0], [0.0, 0.0, 0.3, off]], [far, far]])
+    E = ROWS.repeat(2, 1, 1)
+    near, lost = math.log1p(off**2 / REFINED_DISTANCE), math.log1p(GEOMETRIC_CLAMP / REFINED_DISTANCE)
+    assert math.isclose(float(refined_loss(E, virtual, torch.tensor([1.0, 0.0]))), near, rel_tol=1e-5)
+    assert math.isclose(float(refined_loss(E, virtual, torch.ones(2))), 0.5 * (near + lost), rel_tol=1e-5)
+    assert float(refined_loss(E, virtual, torch.zeros(2))) == 0.0
+
+
+@pytest.mark.parametrize(("weight", "refined_weight"), [(0.0, 0.0), (0.5, 0.0), (2.0, 0.3)])
+def test_all_heads_and_the_refined_answer_are_summed(weight, refined_weight):
     labels = torch.tensor([[1, 0, 0]])
     virtual = torch.tensor([[[0.0, 0.0, 0.3, 0.1]]])
     heads = [HeadOutput(torch.tensor([[float(i), 0.0, -1.0]]), ROWS + 0.1 * i) for i in range(3)]
     batch = {"labels": labels, "virtual": virtual, "virtual_valid": torch.ones(1)}
-    total, parts = network_loss(NetworkOutput(*heads[-1], heads), batch, weight)
+    answer = ROWS + 0.7
+    total, parts = network_loss(NetworkOutput(heads[-1].logits, answer, heads), batch, weight, refined_weight)
     classification = [balanced_cross_entropy(head.logits, labels) for head in heads]
     geometry = [geometric_loss(head.essential, virtual, torch.ones(1)) for head in heads]
-    torch.testing.assert_close(total, sum(classification) + weight * sum(geometry))
+    refined = refined_loss(answer, virtual, torch.ones(1))
+    torch.testing.assert_close(total, sum(classification) + weight * sum(geometry) + refined_weight * refined)
     torch.testing.assert_close(parts["classification"], classification[-1])
     torch.testing.assert_close(parts["geometric"], geometry[-1])
+    torch.testing.assert_close(parts["refined"], refined)
 
 
 def test_loss_falls_on_one_pair():
