@@ -152,7 +152,7 @@ class MGCANet(nn.Module):
     2. stages 2 and 3 see, besides, the epipolar residual of the previous essential matrix and
        relu(tanh(previous logits)), both detached
     3. final consensus over the outputs of all stages gives the answer
-    4. the essential matrix of the answer is refined on its manifold
+    4. outside training, the essential matrix of the answer is refined on its manifold
 
     Feature maps are (B, N, C) inside: products with matches as rows, gathers of whole rows, no transposes.
     """
@@ -189,8 +189,9 @@ class MGCANet(nn.Module):
         if self.final is not None:
             agreed = self.final([stage.output for stage in features])
             heads.append(self.final_head(agreed, prior, correspondences))
-        with torch.autocast(correspondences.device.type, enabled=False):
-            essential = refine_essential(correspondences, heads[-1].logits, heads[-1].essential)
+        essential = heads[-1].essential
+        if not self.training:
+            essential = refine_essential(correspondences, heads[-1].logits, essential)
         return NetworkOutput(heads[-1].logits, essential, heads)
 
     @staticmethod

@@ -8,6 +8,7 @@ from torch.nn import functional as F
 
 from ..network import NetworkOutput
 from ..network.eight_point import symmetric_epipolar_distance_squared
+from ..network.essential_refinement import refine_essential
 from .labels import NEGATIVE, POSITIVE
 
 GEOMETRIC_CLAMP = 0.1
@@ -31,8 +32,7 @@ def geometric_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
 
     Squared symmetric epipolar distance; pairs with ``valid`` (B,) 0 don't count.
     """
-    distance = symmetric_epipolar_distance_squared(virtual, essential).clamp_max(GEOMETRIC_CLAMP)
-    return (distance.mean(1) * valid).sum() / valid.sum().clamp_min(1.0)
+    return _mean_of_valid(_virtual_distance(essential, virtual), valid)
 
 
 def refined_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
@@ -41,24 +41,39 @@ def refined_loss(essential: Tensor, virtual: Tensor, valid: Tensor) -> Tensor:
     The logarithm lets a pair that is nearly right teach as much as one that is lost. Pairs with ``valid`` (B,) 0
     don't count.
     """
-    distance = symmetric_epipolar_distance_squared(virtual, essential).clamp_max(GEOMETRIC_CLAMP).mean(1)
-    return (torch.log1p(distance / REFINED_DISTANCE) * valid).sum() / valid.sum().clamp_min(1.0)
+    return _mean_of_valid(torch.log1p(_virtual_distance(essential, virtual) / REFINED_DISTANCE), valid)
 
 
 def network_loss(
     output: NetworkOutput, batch: dict[str, Tensor], geometric_weight: float, refined_weight: float = 0.0
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """Loss summed over all heads and the refined answer, and its parts (of the last head) for the log."""
+    """Loss summed over all heads and, where it has a weight, the refined answer; its last parts for the log.
+
+    ``batch`` holds ``correspondences`` (B, N, 4), ``labels`` (B, N), ``virtual`` (B, V, 4), ``virtual_valid`` (B,).
+    Without a weight the answer is not refined, and its part is 0.
+    """
     total = output.logits.new_zeros(())
     for head in output.heads:
         classification = balanced_cross_entropy(head.logits, batch["labels"])
         geometry = geometric_loss(head.essential, batch["virtual"], batch["virtual_valid"])
         total = total + classification + geometric_weight * geometry
-    refined = refined_loss(output.essential, batch["virtual"], batch["virtual_valid"])
+    refined = total.new_zeros(())
     if refined_weight:
+        essential = refine_essential(batch["correspondences"], output.logits, output.heads[-1].essential)
+        refined = refined_loss(essential, batch["virtual"], batch["virtual_valid"])
         total = total + refined_weight * refined
     parts = {"classification": classification, "geometric": geometry, "refined": refined}
     return total, {name: part.detach() for name, part in parts.items()}
+
+
+def _virtual_distance(essential: Tensor, virtual: Tensor) -> Tensor:
+    """Mean clamped distance² (B,) of each pair's virtual points."""
+    return symmetric_epipolar_distance_squared(virtual, essential).clamp_max(GEOMETRIC_CLAMP).mean(1)
+
+
+def _mean_of_valid(values: Tensor, valid: Tensor) -> Tensor:
+    """Mean of ``values`` (B,) where ``valid`` (B,) is 1; 0 where none is."""
+    return (values * valid).sum() / valid.sum().clamp_min(1.0)
 
 
 def precision_recall(logits: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:

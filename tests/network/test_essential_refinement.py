@@ -17,7 +17,7 @@ WRONG = 40
 
 
 def noisy_pair(seed: int, flat: bool = False, noise: float = 1e-3) -> tuple[Tensor, Tensor, Tensor]:
-    """Correspondences (1, 160, 4) with a pixel of noise, logits (1, 160) that are mostly right, the true E."""
+    """Correspondences (1, 160, 4) with noise (a pixel), logits (1, 160) that are mostly right, the true E."""
     rng = np.random.default_rng(seed)
     R, t = rotation_from_vector(rng.uniform(-0.3, 0.3, 3)), rng.normal(size=3)
     depth = rng.uniform(5.0, 5.2, 160) if flat else rng.uniform(4, 10, 160)

@@ -9,6 +9,7 @@ import torch
 from networks import TINY, two_view_batch
 
 from mgca_filter.network import HeadOutput, MGCANet, NetworkOutput
+from mgca_filter.network.essential_refinement import refine_essential
 from mgca_filter.training.loss import (
     GEOMETRIC_CLAMP,
     REFINED_DISTANCE,
@@ -84,16 +85,17 @@ def test_all_heads_and_the_refined_answer_are_summed(weight, refined_weight):
     labels = torch.tensor([[1, 0, 0]])
     virtual = torch.tensor([[[0.0, 0.0, 0.3, 0.1]]])
     heads = [HeadOutput(torch.tensor([[float(i), 0.0, -1.0]]), ROWS + 0.1 * i) for i in range(3)]
-    batch = {"labels": labels, "virtual": virtual, "virtual_valid": torch.ones(1)}
-    answer = ROWS + 0.7
-    total, parts = network_loss(NetworkOutput(heads[-1].logits, answer, heads), batch, weight, refined_weight)
+    correspondences = torch.rand(1, 3, 4)
+    batch = {"correspondences": correspondences, "labels": labels, "virtual": virtual, "virtual_valid": torch.ones(1)}
+    total, parts = network_loss(NetworkOutput(*heads[-1], heads), batch, weight, refined_weight)
     classification = [balanced_cross_entropy(head.logits, labels) for head in heads]
     geometry = [geometric_loss(head.essential, virtual, torch.ones(1)) for head in heads]
+    answer = refine_essential(correspondences, *heads[-1])
     refined = refined_loss(answer, virtual, torch.ones(1))
     torch.testing.assert_close(total, sum(classification) + weight * sum(geometry) + refined_weight * refined)
     torch.testing.assert_close(parts["classification"], classification[-1])
     torch.testing.assert_close(parts["geometric"], geometry[-1])
-    torch.testing.assert_close(parts["refined"], refined)
+    torch.testing.assert_close(parts["refined"], refined if refined_weight else torch.tensor(0.0))
 
 
 def test_loss_falls_on_one_pair():
