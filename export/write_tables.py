@@ -2,7 +2,8 @@
 
 The JSON file comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures need
 matplotlib; those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best
-rival and plain RANSAC keep of the example pair: right matches green, wrong ones red.
+rival and plain RANSAC keep of the example pair: right matches green, wrong ones red. The model card also gets the
+figures by scene and by difficulty, beside those of the strongest rivals.
 """
 
 from __future__ import annotations
@@ -12,18 +13,18 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from mgca_filter.evaluation.environment import BUSY_LOAD
 from mgca_filter.evaluation.figures import draw_figures
-from mgca_filter.evaluation.pairs import select_pairs
+from mgca_filter.evaluation.pairs import ALL_PAIRS, ALL_SCENES, select_pairs
 from mgca_filter.evaluation.qualitative import draw_pairs
 from mgca_filter.evaluation.registry import RIVAL_ROWS, parse_method
 from mgca_filter.evaluation.report import timed_pairs
 from mgca_filter.evaluation.summary import best_rival
 
 ROOT = Path(__file__).resolve().parent.parent
-FILES = ("README.md", "mgca_filter/models/mgca_small.md")
+README, MODEL_CARD = "README.md", "mgca_filter/models/mgca_small.md"
 FIGURES = "docs/figures"
 EXAMPLE = "examples/images/courtyard.txt"
 COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms")
@@ -36,7 +37,21 @@ LABELS = {
     "mutual + ratio 0.9 + network order + PROSAC 0.5 px": "mutual + ratio 0.9, sorted by our scores, PROSAC 0.5 px",
     "mutual + ratio 0.9 + network order + PoseLib progressive 0.75 px": "the same with PoseLib progressive 0.75 px",
 }
-MARKERS = re.compile(r"(<!-- scoreboard -->\n).*?(<!-- /scoreboard -->)", re.DOTALL)
+NOT_OPENCV = ("PoseLib", "DEGENSAC")
+
+
+class Section(NamedTuple):
+    """A generated part of a page, between ``<!-- name -->`` and ``<!-- /name -->``."""
+
+    name: str
+    text: str
+
+    def fill(self, content: str, where: str) -> str:
+        """``content`` with the text between its markers; ``where`` names it in the message when there are none."""
+        markers = re.compile(rf"(<!-- {self.name} -->\n).*?(<!-- /{self.name} -->)", re.DOTALL)
+        if not markers.search(content):
+            raise SystemExit(f"{where}: no {self.name} markers")
+        return markers.sub(lambda match: match[1] + self.text + match[2], content)
 
 
 def table(rows: list[dict[str, Any]], scene: str, columns: tuple[str, ...]) -> list[str]:
@@ -49,7 +64,7 @@ def table(rows: list[dict[str, Any]], scene: str, columns: tuple[str, ...]) -> l
     return lines
 
 
-def section(summary: dict[str, Any]) -> str:
+def scoreboard(summary: dict[str, Any]) -> Section:
     """Both tables with what has to be known to read them."""
     rows = summary["rows"]
     scenes = sorted({row["scene"] for row in rows} - {"all", "pairs"})
@@ -84,14 +99,31 @@ def section(summary: dict[str, Any]) -> str:
         "`docs/scoreboard.json`; curves and a picture: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
         "",
     ]
-    return "\n".join(lines)
+    return Section("scoreboard", "\n".join(lines))
 
 
-def fill(content: str, text: str, where: str) -> str:
-    """``content`` with ``text`` between the markers; ``where`` names it in the message when there are none."""
-    if not MARKERS.search(content):
-        raise SystemExit(f"{where}: no scoreboard markers")
-    return MARKERS.sub(lambda match: match[1] + text + match[2], content)
+def difficulty(summary: dict[str, Any]) -> Section:
+    """The filter by scene and by difficulty of the pair, beside the best row that OpenCV alone gives and the best rival."""
+    opencv_rows = [row for row in summary["rows"] if not any(name in row["method"] for name in NOT_OPENCV)]
+    rivals = dict.fromkeys(best_rival({"rows": rows}, "product") for rows in (opencv_rows, summary["rows"]))
+    header = ["", "pairs", "mAP@5", "mAP@20", *(f"mAP@20, {rival}" for rival in rivals)]
+    lines = [f"| {' | '.join(header)} |", "|---|" + "---:|" * (len(header) - 1)]
+
+    def add(name: str, pairs: int, figures: dict[str, dict[str, float]]) -> None:
+        ours = figures["product"]
+        values = [ours["mAP@5"], ours["mAP@20"], *(figures[rival]["mAP@20"] for rival in rivals)]
+        lines.append(f"| {name} | {pairs} | " + " | ".join(f"{value:.1f}" for value in values) + " |")
+
+    by_scene: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in summary["rows"]:
+        by_scene.setdefault(row["scene"], {})[row["method"]] = row
+    for scene, figures in by_scene.items():
+        if scene not in (ALL_SCENES, ALL_PAIRS):
+            add(f"scene `{scene}`", figures["product"]["pairs"], figures)
+    for entry in summary["difficulty"]:
+        for group in entry["groups"]:
+            add(f"{entry['property']} {group['group']}", group["pairs"], group["methods"])
+    return Section("difficulty", "\n".join([*lines, ""]))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -101,9 +133,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout to write to (default: this one)")
     options = parser.parse_args(arguments)
     summary = json.loads(options.scoreboard.read_text(encoding="utf-8"))
-    for name in FILES:
+    board = scoreboard(summary)
+    for name, sections in ((README, [board]), (MODEL_CARD, [board, difficulty(summary)])):
         path = options.root / name
-        path.write_text(fill(path.read_text(encoding="utf-8"), section(summary), str(path)), encoding="utf-8")
+        content = path.read_text(encoding="utf-8")
+        for section in sections:
+            content = section.fill(content, str(path))
+        path.write_text(content, encoding="utf-8")
     pictured = dict.fromkeys([RIVAL_ROWS[0], best_rival(summary, "product"), "product"])
     rows = [parse_method(name) for name in pictured]
     example = select_pairs(ROOT / EXAMPLE, data_format="pairs")

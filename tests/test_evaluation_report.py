@@ -163,7 +163,7 @@ def test_settings_are_printed_with_the_table():
 
 def test_latex_escapes_and_balances():
     text = format_report(small_summary(), "latex")
-    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 6
+    assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == 9
     assert r"median\_ms" in text
     assert r"95 \%" in text
     for line in text.splitlines():

@@ -12,8 +12,24 @@ ROWS = {"mAP@5": 50.0, "mAP@20": 61.3, "AUC@5": 30.0, "AUC@10": 40.0, "AUC@20": 
 SUMMARY = {
     "rows": [
         {"method": method, "scene": scene, "pairs": 3, **ROWS, "median_ms": 7.0, "timed_pairs": 2}
-        for method in ("NN + MAGSAC 0.5 px", "product")
+        for method in ("NN + MAGSAC 0.5 px", "mutual + PoseLib 0.75 px", "product")
         for scene in ("hall", "all", "pairs")
+    ],
+    "difficulty": [
+        {
+            "property": "baseline angle",
+            "groups": [
+                {
+                    "group": "below 5°",
+                    "pairs": 2,
+                    "methods": {
+                        "NN + MAGSAC 0.5 px": {"mAP@5": 10.0, "mAP@20": 20.0},
+                        "mutual + PoseLib 0.75 px": {"mAP@5": 30.0, "mAP@20": 40.0},
+                        "product": {"mAP@5": 50.0, "mAP@20": 60.0},
+                    },
+                }
+            ],
+        }
     ],
     "versions": {"opencv-contrib-python-headless": "5.0.0"},
     "machine": {"processor": "Abacus"},
@@ -25,31 +41,45 @@ SUMMARY = {
 
 def test_rows_of_equal_time_are_explained():
     script = load_export_module("write_tables")
-    assert "as much time as the filter" not in script.section(SUMMARY)
-    matched = script.section({**SUMMARY, "time_matched": [{"method": "x"}]})
+    assert "as much time as the filter" not in script.scoreboard(SUMMARY).text
+    matched = script.scoreboard({**SUMMARY, "time_matched": [{"method": "x"}]}).text
     assert "as much time as the filter" in matched
     assert "`python -m mgca_filter.evaluation BUNDLES --seeds 3 --times 2 --time-matched product`" in matched
 
 
 def test_seeds_are_told():
     script = load_export_module("write_tables")
-    assert "averaged over 3 seeds" in script.section(SUMMARY)
-    once = script.section({**SUMMARY, "settings": {"seeds": 1}})
+    assert "averaged over 3 seeds" in script.scoreboard(SUMMARY).text
+    once = script.scoreboard({**SUMMARY, "settings": {"seeds": 1}}).text
     assert "run once" in once
     assert "--seeds 1 " in once
+
+
+def test_the_filter_stands_beside_the_strongest_rivals_by_scene_and_difficulty():
+    script = load_export_module("write_tables")
+    rows = [dict(row, **{"mAP@20": 62.0}) if "PoseLib" in row["method"] else row for row in SUMMARY["rows"]]
+    header, _, *lines = script.difficulty({**SUMMARY, "rows": rows}).text.splitlines()
+    assert header.endswith("| mAP@20, NN + MAGSAC 0.5 px | mAP@20, mutual + PoseLib 0.75 px |")
+    assert lines == [
+        "| scene `hall` | 3 | 50.0 | 61.3 | 61.3 | 62.0 |",
+        "| baseline angle below 5° | 2 | 50.0 | 60.0 | 20.0 | 40.0 |",
+    ]
 
 
 def test_tables_and_figures_are_written(tmp_path: Path):
     pytest.importorskip("matplotlib")
     script = load_export_module("write_tables")
     (tmp_path / "mgca_filter" / "models").mkdir(parents=True)
-    for name in script.FILES:
-        (tmp_path / name).write_text("above\n<!-- scoreboard -->\nstale table\n<!-- /scoreboard -->\nbelow\n")
+    board = "above\n<!-- scoreboard -->\nstale table\n<!-- /scoreboard -->\nbelow\n"
+    (tmp_path / script.README).write_text(board)
+    (tmp_path / script.MODEL_CARD).write_text(f"<!-- difficulty -->\nstale figures\n<!-- /difficulty -->\n{board}")
     (tmp_path / "board.json").write_text(json.dumps(SUMMARY))
     script.main([str(tmp_path / "board.json"), "--root", str(tmp_path)])
-    for name in script.FILES:
-        text = (tmp_path / name).read_text()
-        assert text.startswith("above\n")
+    card = (tmp_path / script.MODEL_CARD).read_text()
+    assert "| baseline angle below 5° | 2 | 50.0 | 60.0 | 20.0 |\n<!-- /difficulty -->" in card
+    assert "stale figures" not in card
+    for text in ((tmp_path / script.README).read_text(), card):
+        assert "above\n<!-- scoreboard -->\n" in text
         assert text.endswith("below\n")
         assert "stale table" not in text
         assert "| **mgca_filter**, default options | 50.0 | 61.3 |" in text

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene_bundle import ScenePair
+from .difficulty import PairProperties
 from .score_counts import ScoreCounts
 
 FloatArray = NDArray[np.float64]
@@ -91,6 +92,7 @@ class PairOutcome:
             could not be read.
         paper: (precision, recall, F) at logit > 2, for methods that have logits.
         counts: right and wrong matches over the scores, likewise.
+        properties: how hard the pair is; None where it could not be read.
     """
 
     pair: int
@@ -102,6 +104,7 @@ class PairOutcome:
     failure: str = ""
     paper: tuple[float, float, float] | None = None
     counts: ScoreCounts | None = None
+    properties: PairProperties | None = None
 
     @property
     def unreadable(self) -> bool:
@@ -110,11 +113,13 @@ class PairOutcome:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> PairOutcome:
-        """Outcome from what ``dataclasses.asdict`` gave; older results may hold other fields and lack the last two."""
+        """Outcome from what ``dataclasses.asdict`` gave; older results may hold other fields, and lack the last three."""
         values = {field.name: content[field.name] for field in fields(cls) if field.name in content}
         for name in ("kept", "mask", "paper"):
             if values.get(name) is not None:
                 values[name] = tuple(values[name])
         if values.get("counts") is not None:
             values["counts"] = ScoreCounts.from_json(values["counts"])
+        if values.get("properties") is not None:
+            values["properties"] = PairProperties(**values["properties"])
         return cls(**values)

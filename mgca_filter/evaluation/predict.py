@@ -14,6 +14,7 @@ import numpy as np
 from ..epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
 from ..errors import DatasetError
 from ..scene_bundle import ScenePair
+from .difficulty import PairProperties
 from .environment import one_thread
 from .methods import UNREADABLE, Answer, Method, PairOutcome
 from .metrics import FAILURE_DEG, PAPER_LOGIT, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
@@ -206,4 +207,5 @@ def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
         failure=failure,
         paper=paper,
         counts=counts,
+        properties=PairProperties.of(pair, truth),
     )

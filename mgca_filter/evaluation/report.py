@@ -17,11 +17,13 @@ MISSING = "–"
 
 
 def format_report(summary: Mapping[str, Any], style: Style) -> str:
-    """The summary as text: headline, mean over pairs, mAP@20 by scene, decisions, intervals, differences, notes.
+    """The summary as text: headline, mean over pairs, mAP@20 by scene and difficulty, decisions, intervals, notes.
 
     LaTeX holds the tables alone, for ``booktabs``.
     """
-    tables = [*_mean_tables(summary), ("mAP@20 by scene", *_scene_table(summary["rows"])), _decision_table(summary)]
+    tables = [*_mean_tables(summary), ("mAP@20 by scene", *_scene_table(summary["rows"]))]
+    tables += [_difficulty_table(entry) for entry in summary["difficulty"]]
+    tables.append(_decision_table(summary))
     if any("intervals" in row for row in summary["rows"]):
         tables.append(_interval_table(summary["rows"]))
     if summary["differences"]:
@@ -99,6 +101,15 @@ def _scene_table(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[lis
     figures = {(row["method"], row["scene"]): row["mAP@20"] for row in rows}
     methods = list(dict.fromkeys(row["method"] for row in rows))
     return ["method", *scenes], [[name, *(f"{figures[name, scene]:.1f}" for scene in scenes)] for name in methods]
+
+
+def _difficulty_table(entry: Mapping[str, Any]) -> tuple[str, list[str], list[list[str]]]:
+    groups = entry["groups"]
+    header = [f"{group['group']} ({group['pairs']})" for group in groups]
+    body = [
+        [method, *(f"{group['methods'][method]['mAP@20']:.1f}" for group in groups)] for method in groups[0]["methods"]
+    ]
+    return f"mAP@20 by {entry['property']} (number of pairs)", ["method", *header], body
 
 
 def _decision_table(summary: Mapping[str, Any]) -> tuple[str, list[str], list[list[str]]]:

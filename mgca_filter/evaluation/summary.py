@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from .curves import precision_recall_curves, recall_curves, reliability_tables
+from .difficulty import PairProperties, figures_by_difficulty
 from .methods import UNREADABLE, PairOutcome
 from .metrics import (
     FAILURE_DEG,
@@ -39,6 +40,8 @@ NOTES = (
     "Times: wall clock of tests, network and estimator on one thread, detection and matching not counted; pair by pair "
     "all rows in turn, so that whatever else the machine does hits them alike.",
     "OpenCV's estimators fix their own seeds and run once; PoseLib, DEGENSAC and the filter are averaged over seeds.",
+    "Candidates are the raw matches that the filter's shipped models look at; the baseline angle lies between the "
+    "viewing rays of a right match (median of the pair). By difficulty: means over pairs.",
     "PROSAC and PoseLib with progressive sampling get their matches sorted: by ratio, or by the network's scores.",
 )
 
@@ -72,7 +75,8 @@ def summarize(
     Returns:
         ``rows`` (one per method and scene, then scene "all" = mean over scenes and "pairs" = mean over pairs),
         ``differences``, ``failures`` (reasons by method), ``unreadable`` (pairs that no method could have solved),
-        ``curves``, ``timing`` and ``notes``, and the context's own fields.
+        ``difficulty`` (figures on easier and harder pairs), ``curves``, ``timing`` and ``notes``, and the context's own
+        fields.
     """
     errors = {name: scene_errors(outcomes) for name, outcomes in results.items()}
     times = {} if timing is None else timing.milliseconds
@@ -94,6 +98,7 @@ def summarize(
         "differences": differences,
         "failures": {name: _failures(outcomes) for name, outcomes in results.items()},
         "unreadable": _unreadable(results),
+        "difficulty": figures_by_difficulty(errors, _properties(results)),
         "curves": {
             "recall": recall_curves(errors),
             "precision_recall": precision_recall_curves(results),
@@ -235,6 +240,20 @@ def _failures(outcomes: SceneOutcomes) -> dict[str, int]:
     """Number of failures by reason, all seeds counted."""
     counter = Counter(o.failure for runs in outcomes.values() for run in runs for o in run if o.failure)
     return dict(counter.most_common())
+
+
+def _properties(results: Mapping[str, SceneOutcomes]) -> list[PairProperties | None]:
+    """How hard each pair is, scene by scene: from any outcome that says so, since older ones may not."""
+    found = {
+        (scene, outcome.pair): outcome.properties
+        for outcomes in results.values()
+        for scene, runs in outcomes.items()
+        for run in runs
+        for outcome in run
+        if outcome.properties is not None
+    }
+    first = next(iter(results.values()))
+    return [found.get((scene, outcome.pair)) for scene, runs in first.items() for outcome in runs[0]]
 
 
 def _unreadable(results: Mapping[str, SceneOutcomes]) -> list[dict[str, Any]]:
