@@ -103,7 +103,7 @@ def scoreboard(summary: dict[str, Any]) -> Section:
 
 
 def difficulty(summary: dict[str, Any]) -> Section:
-    """The filter by scene and by difficulty of the pair, beside the best row that OpenCV alone gives and the best rival."""
+    """The filter by scene and difficulty of the pairs, beside the best row of OpenCV's and the best of all rivals."""
     opencv_rows = [row for row in summary["rows"] if not any(name in row["method"] for name in NOT_OPENCV)]
     rivals = dict.fromkeys(best_rival({"rows": rows}, "product") for rows in (opencv_rows, summary["rows"]))
     header = ["", "pairs", "mAP@5", "mAP@20", *(f"mAP@20, {rival}" for rival in rivals)]

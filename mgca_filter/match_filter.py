@@ -143,7 +143,8 @@ class MatchFilter:
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             ranked = self._rank(pair, job.sent, logits, scores)
-            model = estimate_model(ranked, pair.focal_px, self.fit_options, calibrated=pair.calibrated)
+            proposal = None if job.output is None else job.output.essential
+            model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, proposal)
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
             verdict = judge(pair, model, ranked, self.threshold, self.fit_options)

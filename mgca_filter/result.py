@@ -43,8 +43,8 @@ class FilterResult:
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches``,
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
-            robust fit left it, before the verdict, and its ``origin`` ("start 1", …, "plane"). Where they were
-            measured: ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography``
+            robust fit left it, before the verdict, and its ``origin`` ("network", "start 1", …, "plane"). Where they
+            were measured: ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography``
             (3, 3) that explains the pair, ``focal_factor`` where the matches ask for focal lengths that many times
             those given (rough, a power of 1.2).
     """

@@ -1,4 +1,5 @@
-"""Robust fit of the two-view model to scored matches: several starts, refined, and the choice between them.
+"""Robust fit of the two-view model to scored matches: several starts beside the network's own answer, refined, and the
+choice between them.
 
 All points are on the normalised image planes and thresholds come in pixels with the mean focal length that
 converts them. With intrinsics that can be trusted the model is an essential matrix; with guessed ones it is a
@@ -9,6 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import chain
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +70,7 @@ class RobustFitOptions:
         max_iterations: largest number of samples of a start.
         seed: of the estimator's random numbers.
         starts: runs of the estimator, of which the best-supported model is kept, and which end as soon as two poses
-            agree; None = those that suit the method.
+            agree, the network's among them; None = those that suit the method.
         refine: finish with least squares on the pose, from these models and from the dominant plane's.
         refine_threshold_px: where refinement and support cut the error off, pixels.
     """
@@ -102,7 +105,7 @@ class TwoViewModel:
         M: (3, 3) of unit Frobenius norm, ``x2^T M x1 = 0``: the essential matrix, or, with guessed intrinsics,
             the fundamental matrix expressed in normalised coordinates.
         E: (3, 3) essential matrix of unit Frobenius norm. R: (3, 3) rotation. t: (3,) unit norm.
-        origin: where it was found: ``"start 1"``, ``"start 2"``, … or ``"plane"``.
+        origin: where it was found: ``"network"``, ``"start 1"``, ``"start 2"``, … or ``"plane"``.
     """
 
     M: Array
@@ -114,7 +117,7 @@ class TwoViewModel:
 
 @dataclass(frozen=True)
 class _Fit:
-    """The matrix M (3, 3) that one start found, the matches (K, 4) that it saw, and its name."""
+    """The matrix M (3, 3) that the network or a start found, the matches (K, 4) to refine it on, and its name."""
 
     M: Array
     seen: Array
@@ -136,6 +139,7 @@ def estimate_model(
     focal_px: float,
     options: RobustFitOptions = RobustFitOptions(),
     calibrated: bool = True,
+    network_essential: NDArray[np.floating[Any]] | None = None,
 ) -> TwoViewModel | None:
     """Fit the two-view model to ranked matches.
 
@@ -144,6 +148,8 @@ def estimate_model(
         focal_px: mean focal length, pixels: converts the thresholds.
         options: method, thresholds, starts, seed.
         calibrated: the intrinsics can be trusted: estimate E with five points; else F with seven.
+        network_essential: (3, 3) of any scale, the network's own E, which stands first among what the starts find; one
+            that is not finite, and any with guessed intrinsics, is passed over.
 
     Returns:
         The model, or None where the matches are too few or the estimator finds nothing. Never raises for data.
@@ -155,8 +161,14 @@ def estimate_model(
         return None
     fits = _fits(matches, focal_px, options, calibrated)
     if calibrated:
-        return _best_calibrated(matches, fits, focal_px, options)
+        return _best_calibrated(matches, chain(_proposed(matches, network_essential), fits), focal_px, options)
     return _best_uncalibrated(matches, fits, focal_px, options)
+
+
+def _proposed(matches: RankedMatches, network_essential: NDArray[np.floating[Any]] | None) -> Iterator[_Fit]:
+    """What the network proposes, to be refined on the matches that it accepts."""
+    if network_essential is not None and np.isfinite(network_essential).all():
+        yield _Fit(network_essential.astype(np.float64), matches.above(0.0).correspondences, "network")
 
 
 def _fits(matches: RankedMatches, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Iterator[_Fit]:
@@ -171,7 +183,7 @@ def _fits(matches: RankedMatches, focal_px: float, options: RobustFitOptions, ca
 def _best_calibrated(
     matches: RankedMatches, fits: Iterable[_Fit], focal_px: float, options: RobustFitOptions
 ) -> TwoViewModel | None:
-    """The best-supported pose among the refined starts and the plane's rivals of the best of them."""
+    """The best-supported pose among the refined fits and the plane's rivals of the best of them."""
     threshold = options.refine_threshold_px / focal_px
     poses: list[_Pose] = []
     for fit in fits:
@@ -234,10 +246,13 @@ def _plane_rivals(matches: RankedMatches, best: _Pose, threshold: float, seed: i
 
 
 def estimate_pose(
-    matches: RankedMatches, focal_px: float, options: RobustFitOptions = RobustFitOptions()
+    matches: RankedMatches,
+    focal_px: float,
+    options: RobustFitOptions = RobustFitOptions(),
+    network_essential: NDArray[np.floating[Any]] | None = None,
 ) -> tuple[Array, Array] | None:
     """Relative pose R (3, 3), t (3,) of calibrated images, or None; arguments as in :func:`estimate_model`."""
-    model = estimate_model(matches, focal_px, options)
+    model = estimate_model(matches, focal_px, options, network_essential=network_essential)
     return None if model is None else (model.R, model.t)
 
 

@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 import onnx
 import pytest
-from conftest import METADATA, SIZE, K, build_model
+from conftest import METADATA, SIDEWAYS, SIZE, K, build_model
 from cpp_program import BUILD_TIMEOUT, SOURCE, Pair, assert_same_answer, build, build_program
 
 import mgca_filter
 from mgca_filter import robust_fit
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.epipolar import essential_from_pose, pose_error_deg
 from mgca_filter.pose_refinement import refine_pose, rotation_from_vector
 from mgca_filter.ranking import RankedMatches, match_order
 
@@ -64,9 +64,10 @@ def pair_of_motions(seed: int, *motions: Motion) -> Pair:
     return Pair(keypoints1, keypoints2, matches, K, K)
 
 
-def model_of_sizes(path: Path) -> Path:
-    """A model whose logit is log2(size2 / size1), with scores that are surer than those logits."""
-    model = onnx.load(build_model(path, {**METADATA, "calibration": json.dumps({"scale": 4.0, "offset": 0.0})}))
+def model_of_sizes(path: Path, essential: np.ndarray = SIDEWAYS) -> Path:
+    """A model whose logit is log2(size2 / size1), with scores that are surer than those logits, and of a fixed E."""
+    metadata = {**METADATA, "calibration": json.dumps({"scale": 4.0, "offset": 0.0})}
+    model = onnx.load(build_model(path, metadata, essential=essential))
     values = {"weight": np.eye(8, 1, -2, np.float32), "bias": np.zeros(1, np.float32)}
     for tensor in model.graph.initializer:
         if tensor.name in values:
@@ -101,6 +102,17 @@ def test_two_starts_that_agree_end_the_search(program, tmp_path):
     accepted = replace(OTHER_BODY, count=20, logit=0.3)
     pair = pair_of_motions(0, SCENE, OTHER_BODY, accepted)
     answer = assert_same_answer(program, pair, model_of_sizes(tmp_path / "model.onnx"), tmp_path)
+    assert pose_error_deg(answer["R"], answer["t"], OTHER_BODY.R, OTHER_BODY.t) < 1.0
+
+
+def test_the_networks_own_answer_stands_among_the_starts(program, tmp_path):
+    """The starts would end with the other body, as above."""
+    accepted, essential = replace(OTHER_BODY, count=20, logit=0.3), essential_from_pose(SCENE.R, SCENE.t)
+    pair = pair_of_motions(0, SCENE, OTHER_BODY, accepted)
+    answer = assert_same_answer(program, pair, model_of_sizes(tmp_path / "model.onnx", -essential), tmp_path)
+    assert pose_error_deg(answer["R"], answer["t"], SCENE.R, SCENE.t) < 1.0
+    unknown = model_of_sizes(tmp_path / "unknown.onnx", np.full((3, 3), np.nan))
+    answer = assert_same_answer(program, pair, unknown, tmp_path)
     assert pose_error_deg(answer["R"], answer["t"], OTHER_BODY.R, OTHER_BODY.t) < 1.0
 
 

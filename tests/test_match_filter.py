@@ -16,7 +16,7 @@ from conftest import METADATA, SIZE, K, Scene, build_model, make_scene
 import mgca_filter
 from mgca_filter import FilterResult, MatchAttributes, MatchFilter, MatchPair, Status, filter_many, filter_matches
 from mgca_filter.calibration import largest_set_of_precision
-from mgca_filter.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.epipolar import essential_from_pose, pose_error_deg, sampson_distance
 from mgca_filter.scoring import MAX_NETWORK_MATCHES
 
 
@@ -263,6 +263,17 @@ def test_calibration_of_the_model_file_is_applied(scene: Scene, tmp_path: Path) 
     result = run(scene, path)
     expected = 1 / (1 + np.exp(-(0.5 * result.info["logits"] + 1.0)))
     np.testing.assert_allclose(result.scores, expected, rtol=1e-5)
+
+
+def test_the_networks_own_essential_matrix_may_be_the_answer(tmp_path: Path) -> None:
+    hard = make_scene(right=40, wrong=400)
+    options = {"attributes": None, "confidence": 0.01}  # bare points, which all are accepted, and next to no sampling
+    model = build_model(tmp_path / "m.onnx", essential=essential_from_pose(hard.R, hard.t))
+    result = run(hard, model, **options)
+    assert result.info["origin"] == "network"
+    assert pose_error_deg(result.R, result.t, hard.R, hard.t) < 1.0
+    unaided = run(hard, build_model(tmp_path / "n.onnx"), **options)
+    assert unaided.R is None or pose_error_deg(unaided.R, unaided.t, hard.R, hard.t) > 5.0
 
 
 @pytest.mark.parametrize("bare", [False, True])

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from conftest import K, Scene, make_scene
 
+from mgca_filter import robust_fit
 from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import cross_matrix, pose_error_deg
-from mgca_filter.estimators import METHODS
+from mgca_filter.epipolar import cross_matrix, essential_from_pose, pose_error_deg
+from mgca_filter.estimators import METHODS, fit_epipolar
 from mgca_filter.homography import fit_homography, homography_distance, poses_from_homography, usac_params
 from mgca_filter.pose_refinement import refine_pose, rotation_from_vector, truncated_cost
 from mgca_filter.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
@@ -212,6 +213,52 @@ def test_the_best_supported_start_wins(calibrated: bool) -> None:
     assert model.origin == "start 2"
     alone = estimate_model(ranked, FOCAL, replace(few, starts=(blind,)), calibrated)
     assert alone is None or pose_error_deg(alone.R, alone.t, hard.R, hard.t) > 5.0
+
+
+def test_what_the_network_proposes_can_win() -> None:
+    hard = make_scene(right=40, wrong=400)
+    hopeless_first = RankedMatches.of(normalized(hard), np.argsort(hard.inlier, kind="stable"))
+    few = RobustFitOptions(max_iterations=20, starts=SINGLE_START)
+    nearby = essential_from_pose(rotation_from_vector(np.array([0.001, -0.001, 0.001])) @ hard.R, hard.t)
+    model = estimate_model(hopeless_first, FOCAL, few, network_essential=(-3.0 * nearby).astype(np.float32))
+    assert model is not None
+    assert model.origin == "network"
+    assert pose_error_deg(model.R, model.t, hard.R, hard.t) < 1.0
+    assert model.M.dtype == np.float64
+    alone = estimate_model(hopeless_first, FOCAL, few)
+    assert alone is None or pose_error_deg(alone.R, alone.t, hard.R, hard.t) > 5.0
+
+
+@pytest.mark.parametrize("proposal", [np.full((3, 3), np.nan), np.eye(3), np.zeros((3, 3))])
+def test_a_bad_proposal_does_no_harm(proposal: np.ndarray, scene: Scene) -> None:
+    model = estimate_model(by_ratio(scene), FOCAL, network_essential=proposal)
+    expected = estimate_model(by_ratio(scene), FOCAL)
+    assert model is not None
+    assert expected is not None
+    np.testing.assert_array_equal(model.E, expected.E)
+
+
+def test_guessed_intrinsics_have_no_use_for_the_networks_answer(scene: Scene) -> None:
+    truth = essential_from_pose(scene.R, scene.t)
+    models = [estimate_model(by_ratio(scene), FOCAL, calibrated=False, network_essential=E) for E in (truth, None)]
+    assert models[0] is not None
+    assert models[1] is not None
+    np.testing.assert_array_equal(models[0].M, models[1].M)
+
+
+def test_one_start_that_agrees_with_the_network_is_enough(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+
+    def fit_and_count(*arguments: object) -> np.ndarray | None:
+        runs.append(arguments)
+        return fit_epipolar(*arguments)
+
+    monkeypatch.setattr(robust_fit, "fit_epipolar", fit_and_count)
+    truth = essential_from_pose(scene.R, scene.t)
+    for proposal, expected in ((None, 2), (truth, 1), (np.eye(3), 2)):
+        runs.clear()
+        estimate_model(by_ratio(scene), FOCAL, network_essential=proposal)
+        assert len(runs) == expected
 
 
 def test_pose_puts_points_in_front_however_far(scene: Scene) -> None:

@@ -82,13 +82,14 @@ public:
                             const KnnMatches& matches, const cv::Matx33d& K1, const cv::Matx33d& K2) const {
         const Pair pair = read_pair(keypoints1, keypoints2, matches, K1, K2);
         const std::vector<std::size_t> sent = select_network_input(pair);
+        const NetworkOutput network = run_network(pair, sent);
         FilterResult result;
-        result.logits = compute_logits(pair, sent);
+        result.logits = assemble_logits(pair, sent, network.logits);
         for (std::size_t i = 0; i < matches.size(); ++i) {
             result.scores.push_back(pair.valid[i] ? metadata_.probability(result.logits[i]) : 0.0F);
             result.network_mask.push_back(margin(result.logits[i]) > 0.0F);
         }
-        fit(pair, sent, result);
+        fit(pair, sent, network.E, result);
         return result;
     }
 
@@ -147,17 +148,10 @@ private:
         return candidates;
     }
 
-    /// Logits of all matches: the network's, the prior's below the decision threshold, or invalid.
-    std::vector<float> compute_logits(const Pair& pair, const std::vector<std::size_t>& sent) const {
-        std::vector<float> logits(pair.valid.size(), kInvalidLogit);
-        const auto ceiling = static_cast<float>(metadata_.decision_threshold - kRejectedMargin);
-        for (std::size_t i = 0; i < logits.size(); ++i) {
-            if (pair.valid[i]) {
-                logits[i] = std::min(metadata_.prior.logit(pair.attributes[i]), ceiling);
-            }
-        }
+    /// The network's answer for the matches that enter it; nothing where none does.
+    NetworkOutput run_network(const Pair& pair, const std::vector<std::size_t>& sent) const {
         if (sent.empty()) {
-            return logits;
+            return {};
         }
         std::vector<float> correspondences, attributes;
         for (const std::size_t i : sent) {
@@ -166,7 +160,19 @@ private:
             }
             attributes.insert(attributes.end(), pair.attributes[i].begin(), pair.attributes[i].end());
         }
-        const std::vector<float> answer = network_.infer(std::move(correspondences), std::move(attributes));
+        return network_.infer(std::move(correspondences), std::move(attributes));
+    }
+
+    /// Logits of all matches: the network's, the prior's below the decision threshold, or invalid.
+    std::vector<float> assemble_logits(const Pair& pair, const std::vector<std::size_t>& sent,
+                                       const std::vector<float>& answer) const {
+        std::vector<float> logits(pair.valid.size(), kInvalidLogit);
+        const auto ceiling = static_cast<float>(metadata_.decision_threshold - kRejectedMargin);
+        for (std::size_t i = 0; i < logits.size(); ++i) {
+            if (pair.valid[i]) {
+                logits[i] = std::min(metadata_.prior.logit(pair.attributes[i]), ceiling);
+            }
+        }
         for (std::size_t k = 0; k < sent.size(); ++k) {
             logits[sent[k]] = std::isfinite(answer[k]) ? answer[k] : kInvalidLogit;
         }
@@ -174,7 +180,8 @@ private:
     }
 
     /// The robust fit to what the network saw, then all matches are tested against it.
-    void fit(const Pair& pair, const std::vector<std::size_t>& sent, FilterResult& result) const {
+    void fit(const Pair& pair, const std::vector<std::size_t>& sent, const cv::Matx33d& network_essential,
+             FilterResult& result) const {
         result.mask.assign(pair.valid.size(), 0);
         std::vector<ScoredMatch> scored;
         for (const std::size_t i : sent) {
@@ -185,7 +192,8 @@ private:
         RobustFitOptions fit_options;
         fit_options.confidence = options_.confidence;
         fit_options.seed = options_.seed;
-        const std::optional<Pose> pose = estimate_pose(RankedMatches(scored), pair.focal_px, fit_options);
+        const std::optional<Pose> pose =
+            estimate_pose(RankedMatches(scored), network_essential, pair.focal_px, fit_options);
         if (!pose) {
             return;
         }

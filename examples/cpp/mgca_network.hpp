@@ -33,7 +33,14 @@
 
 namespace mgca {
 
-/// The network: matches of one pair in, one logit for each out. Safe to use from several threads.
+/// What the network says of a pair; not finite where its input is degenerate (all points equal, say).
+struct NetworkOutput {
+    std::vector<float> logits;  ///< One for each match.
+    cv::Matx33d E;              ///< Essential matrix, normalised image planes, of any sign.
+};
+
+/// The network: matches of one pair in, one logit for each and an essential matrix out. Safe to use from several
+/// threads.
 class Network {
 public:
     /// Throws ModelError where the runtime cannot open the file.
@@ -46,10 +53,9 @@ public:
     ///
     /// @param correspondences N rows of x1, y1, x2, y2 on the normalised image planes, finite.
     /// @param attributes N rows of Attributes.
-    /// @return N logits; not finite where the input is degenerate (all points equal, say).
     ///
     /// Throws the runtime's exception (Ort::Exception or cv::Exception) where it fails, for lack of memory, say.
-    std::vector<float> infer(std::vector<float> correspondences, std::vector<float> attributes) const;
+    NetworkOutput infer(std::vector<float> correspondences, std::vector<float> attributes) const;
 
     /// Name and version of the runtime.
     static std::string runtime();
@@ -75,14 +81,16 @@ inline Network::Network(const std::filesystem::path& file) {
     }
 }
 
-inline std::vector<float> Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
+inline NetworkOutput Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
     const int count = static_cast<int>(attributes.size() / kAttributeCount);
     const std::array<int, 3> shape1{1, count, 4}, shape2{1, count, static_cast<int>(kAttributeCount)};
     const std::lock_guard<std::mutex> lock(mutex_);
     net_.setInput(cv::Mat(3, shape1.data(), CV_32F, correspondences.data()), "correspondences");
     net_.setInput(cv::Mat(3, shape2.data(), CV_32F, attributes.data()), "attributes");
-    const cv::Mat logits = net_.forward("logits");
-    return {logits.ptr<float>(), logits.ptr<float>() + count};
+    std::vector<cv::Mat> outputs;
+    net_.forward(outputs, std::vector<cv::String>{"logits", "essential"});
+    const float* logits = outputs[0].ptr<float>();
+    return {{logits, logits + count}, cv::Matx33f(outputs[1].ptr<float>())};
 }
 
 inline std::string Network::runtime() { return std::string("cv::dnn ") + CV_VERSION; }
@@ -115,7 +123,7 @@ inline Network::Network(const std::filesystem::path& file)
     }
 }
 
-inline std::vector<float> Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
+inline NetworkOutput Network::infer(std::vector<float> correspondences, std::vector<float> attributes) const {
     const auto count = static_cast<std::int64_t>(attributes.size() / kAttributeCount);
     const std::array<std::int64_t, 3> shape1{1, count, 4}, shape2{1, count, kAttributeCount};
     const Ort::MemoryInfo memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
@@ -123,11 +131,11 @@ inline std::vector<float> Network::infer(std::vector<float> correspondences, std
         Ort::Value::CreateTensor<float>(memory, correspondences.data(), correspondences.size(), shape1.data(), 3),
         Ort::Value::CreateTensor<float>(memory, attributes.data(), attributes.size(), shape2.data(), 3)};
     constexpr std::array<const char*, 2> input_names{"correspondences", "attributes"};
-    constexpr std::array<const char*, 1> output_names{"logits"};
-    const std::vector<Ort::Value> outputs =
-        session_.Run(Ort::RunOptions(), input_names.data(), inputs.data(), inputs.size(), output_names.data(), 1);
-    const float* logits = outputs.front().GetTensorData<float>();
-    return {logits, logits + count};
+    constexpr std::array<const char*, 2> output_names{"logits", "essential"};
+    const std::vector<Ort::Value> outputs = session_.Run(Ort::RunOptions(), input_names.data(), inputs.data(),
+                                                         inputs.size(), output_names.data(), output_names.size());
+    const float* logits = outputs[0].GetTensorData<float>();
+    return {{logits, logits + count}, cv::Matx33f(outputs[1].GetTensorData<float>())};
 }
 
 inline std::string Network::runtime() {

@@ -1,4 +1,5 @@
-// Robust fit of the relative pose to scored matches: several starts, refined, and the choice between them.
+// Robust fit of the relative pose to scored matches: several starts beside the network's own answer, refined, and the
+// choice between them.
 
 #pragma once
 
@@ -52,6 +53,13 @@ inline const SupportedPose& best_of(const std::vector<SupportedPose>& poses) {
     });
 }
 
+/// The pose of an essential matrix, refined on the matches; nothing where none of them is near it.
+inline std::optional<Pose> refined_pose(const std::vector<Correspondence>& seen, const cv::Matx33d& E,
+                                        double threshold) {
+    const std::optional<Pose> pose = pose_from_essential(E, near_model(seen, E, threshold));
+    return pose ? std::optional<Pose>(refine_pose(seen, *pose, threshold)) : std::nullopt;
+}
+
 /// What start number `index` finds, refined; each start draws other samples.
 inline std::optional<Pose> run_start(const RankedMatches& matches, std::size_t index, double focal_px,
                                      const RobustFitOptions& options) {
@@ -63,16 +71,15 @@ inline std::optional<Pose> run_start(const RankedMatches& matches, std::size_t i
     const std::optional<cv::Matx33d> E =
         fit_essential(seen, start.threshold_factor * options.threshold_px / focal_px, options.confidence,
                       options.max_iterations, static_cast<int>(seed));
-    if (!E) {
-        return std::nullopt;
-    }
-    const std::optional<Pose> pose = pose_from_essential(*E, near_model(seen, *E, threshold));
-    return pose ? std::optional<Pose>(refine_pose(seen, *pose, threshold)) : std::nullopt;
+    return E ? refined_pose(seen, *E, threshold) : std::nullopt;
 }
 
 /// True where the best-supported pose has been found twice.
 inline bool agree(const std::vector<SupportedPose>& poses) {
     constexpr double kAgreementDeg = 1.0, kAgreementSupportShare = 0.97;
+    if (poses.empty()) {
+        return false;
+    }
     const SupportedPose& best = best_of(poses);
     return std::any_of(poses.begin(), poses.end(), [&](const SupportedPose& other) {
         return &other != &best && other.support > kAgreementSupportShare * best.support &&
@@ -106,28 +113,30 @@ inline std::vector<SupportedPose> plane_rivals(const RankedMatches& matches, con
 
 }  // namespace detail
 
-/// Fit the relative pose: the best-supported one among the refined starts, which end as soon as two agree, and the
-/// rivals that the dominant plane of the best of them allows.
+/// Fit the relative pose: the best-supported one among the network's own and those of the starts, all refined, which
+/// end as soon as two agree, and the rivals that the dominant plane of the best of them allows.
 ///
+/// @param network_essential the network's own E, of any scale; one that is not finite is passed over.
 /// @param focal_px mean focal length, pixels: converts the thresholds.
 /// @return the pose; nothing where the matches are fewer than kMinMatches, no pose is found, or fewer than kMinMatches
 ///     of the accepted ones agree with it. Never throws for data.
-inline std::optional<Pose> estimate_pose(const RankedMatches& matches, double focal_px,
-                                         const RobustFitOptions& options) {
+inline std::optional<Pose> estimate_pose(const RankedMatches& matches, const cv::Matx33d& network_essential,
+                                         double focal_px, const RobustFitOptions& options) {
     if (matches.size() < kMinMatches) {
         return std::nullopt;
     }
     const double threshold = options.refine_threshold_px / focal_px;
     std::vector<detail::SupportedPose> poses;
-    for (std::size_t index = 0; index < detail::kStarts.size(); ++index) {
-        const std::optional<Pose> pose = detail::run_start(matches, index, focal_px, options);
-        if (!pose) {
-            continue;
+    const auto add = [&](const std::optional<Pose>& pose) {
+        if (pose) {
+            poses.push_back({*pose, matches.support(*pose, threshold)});
         }
-        poses.push_back({*pose, matches.support(*pose, threshold)});
-        if (detail::agree(poses)) {
-            break;
-        }
+    };
+    if (cv::checkRange(network_essential)) {
+        add(detail::refined_pose(matches.above(0.0), network_essential, threshold));
+    }
+    for (std::size_t index = 0; index < detail::kStarts.size() && !detail::agree(poses); ++index) {
+        add(detail::run_start(matches, index, focal_px, options));
     }
     if (poses.empty()) {
         return std::nullopt;

@@ -47,14 +47,16 @@ def order_by_ratio(logits: FloatArray, ratio: FloatArray, known: NDArray[np.bool
 
 @dataclass(frozen=True)
 class Variant:
-    """A fit with one thing changed: fields of :class:`RobustFitOptions`, or the order of the matches."""
+    """A fit with one thing changed: fields of :class:`RobustFitOptions`, the order, or what the network proposes."""
 
     changes: Mapping[str, Any]
     order: Order = match_order
+    network_essential: bool = True
 
 
 VARIANTS = {
     AS_IT_IS: Variant({}),
+    "without the network's own E": Variant({}, network_essential=False),
     "one start, logit > 0": Variant({"starts": SINGLE_START}),
     "one start, logit > −1": Variant({"starts": (Start(-1.0, 1.0),)}),
     "the first two starts": Variant({"starts": RobustFitOptions().runs[:2]}),
@@ -74,11 +76,12 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class ScoredPair:
-    """A pair and what the network says of it: logits (M,), probabilities (M,), the rows (N,) that may be fitted to."""
+    """A pair and what the network says: logits (M,), probabilities (M,), its E (3, 3); the rows (N,) to fit to."""
 
     pair: ScenePair
     logits: FloatArray
     scores: FloatArray
+    essential: FloatArray | None
     rows: NDArray[np.intp]
 
     @classmethod
@@ -86,7 +89,8 @@ class ScoredPair:
         """One pass of the network."""
         result = filter_pair(pair, np.arange(len(pair.points1)), model, {"method": "none"})
         rows = np.flatnonzero(candidate_mask(pair.attributes.encode(len(pair.points1))))
-        return cls(pair, result.info["logits"].astype(np.float64), result.scores.astype(np.float64), rows)
+        logits, scores = result.info["logits"].astype(np.float64), result.scores.astype(np.float64)
+        return cls(pair, logits, scores, result.info["network_essential"], rows)
 
     def error_deg(self, variant: Variant, options: RobustFitOptions) -> float:
         """Pose error of a fit, 180 without a pose."""
@@ -94,7 +98,8 @@ class ScoredPair:
         order = variant.order(self.logits[self.rows], attributes[:, 0].astype(np.float64), attributes[:, 5] > 0)
         ranked = RankedMatches.of(self.pair.correspondences, self.rows[order], self.scores, self.logits)
         focal_px = mean_focal_length(self.pair.K1, self.pair.K2)
-        pose = estimate_pose(ranked, focal_px, replace(options, **variant.changes))
+        essential = self.essential if variant.network_essential else None
+        pose = estimate_pose(ranked, focal_px, replace(options, **variant.changes), essential)
         return FAILURE_DEG if pose is None else pose_error_deg(*pose, self.pair.R, self.pair.t)
 
 

@@ -113,7 +113,7 @@ class PairOutcome:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> PairOutcome:
-        """Outcome from what ``dataclasses.asdict`` gave; older results may hold other fields, and lack the last three."""
+        """Outcome from what ``dataclasses.asdict`` gave; older ones may hold other fields, and lack the last three."""
         values = {field.name: content[field.name] for field in fields(cls) if field.name in content}
         for name in ("kept", "mask", "paper"):
             if values.get(name) is not None:

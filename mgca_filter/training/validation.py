@@ -113,9 +113,13 @@ def evaluate_pair(network: MGCANet, pair: ScenePair, given: InputList | None = N
     entered = output.logits[0].double().cpu().numpy()
     logits[rows] = entered
     order = match_order(entered, encoded[rows, 0], encoded[rows, 5] > 0)
-    fit = estimate_pose(RankedMatches.of(x, order, sigmoid(entered), entered), mean_focal_length(pair.K1, pair.K2))
+    essential, ranked = (
+        output.essential[0].double().cpu().numpy(),
+        RankedMatches.of(x, order, sigmoid(entered), entered),
+    )
+    fit = estimate_pose(ranked, mean_focal_length(pair.K1, pair.K2), network_essential=essential)
     best = np.argsort(-entered)[: max(len(entered) // 10, 8)]
-    own = pose_from_essential(output.essential[0].double().cpu().numpy(), x[best])
+    own = pose_from_essential(essential, x[best])
     return PairFigures(logits, truth, _error(fit, pair), _error(own, pair))
 
 
