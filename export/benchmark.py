@@ -1,8 +1,8 @@
 """How fast is the filter here? ``python export/benchmark.py [--threads 2] [--bundle FILE --pair 0]`` prints ratios.
 
 All calls run in turn in one process, on as many threads, on the raw SIFT matches of the example pair (or of a pair of
-a scene bundle); medians. Cold start and memory are measured in processes of their own. Where the milliseconds of the
-network go is told by ``python export/floor.py``.
+a scene bundle); medians. Whole calls have the pose error of their answer beside them. Cold start and memory are
+measured in processes of their own. Where the milliseconds of the network go is told by ``python export/floor.py``.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mgca_filter import BackendError, MatchFilter, match_images, model_path
+from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
 from mgca_filter.backends import open_backend
 from mgca_filter.backends.onnx_backend import THREADS_VARIABLE
 from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from mgca_filter.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
+from mgca_filter.robust_fit import pose_from_essential
 from mgca_filter.scene_bundle import SceneBundle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "images"
@@ -63,7 +64,7 @@ print(peak_mib() - before)
 
 @dataclass(frozen=True)
 class RawPair:
-    """Raw matches as a user holds them, their pixels (M, 2) under K (3, 3), and the share of right ones."""
+    """Raw matches as a user holds them, their pixels (M, 2) under K (3, 3), and the true pose R (3, 3), t (3,)."""
 
     arguments: tuple[Any, Any, Any]
     attributes: Any
@@ -71,7 +72,19 @@ class RawPair:
     points2: np.ndarray
     K1: np.ndarray
     K2: np.ndarray
-    inlier_share: float
+    R: np.ndarray
+    t: np.ndarray
+
+    @property
+    def correspondences(self) -> np.ndarray:
+        """(M, 4) on the normalised image planes."""
+        return np.hstack([normalize_points(self.points1, self.K1), normalize_points(self.points2, self.K2)])
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the matches near their true epipolar lines."""
+        distance = symmetric_epipolar_distance_squared(self.correspondences, essential_from_pose(self.R, self.t))
+        return float(np.mean(distance < INLIER_DISTANCE))
 
 
 def example_pair() -> RawPair:
@@ -82,33 +95,34 @@ def example_pair() -> RawPair:
     matched = match_images(*images, K1=K1, K2=K2)
     points1 = np.array([matched.keypoints1[row[0].queryIdx].pt for row in matched.matches])
     points2 = np.array([matched.keypoints2[row[0].trainIdx].pt for row in matched.matches])
-    share = inlier_share(points1, points2, K1, K2, np.array(truth["R"]), np.array(truth["t"]))
     arguments = (matched.keypoints1, matched.keypoints2, matched.matches)
-    return RawPair(arguments, None, points1, points2, K1, K2, share)
+    return RawPair(arguments, None, points1, points2, K1, K2, np.array(truth["R"]), np.array(truth["t"]))
 
 
 def bundle_pair(path: Path, index: int) -> RawPair:
     """Raw matches of a pair of a scene bundle: arrays."""
     pair = SceneBundle(path)[index]
-    share = inlier_share(pair.points1, pair.points2, pair.K1, pair.K2, pair.R, pair.t)
     arguments = (pair.points1, pair.points2, None)
-    return RawPair(arguments, pair.attributes, pair.points1, pair.points2, pair.K1, pair.K2, share)
-
-
-def inlier_share(
-    points1: np.ndarray, points2: np.ndarray, K1: np.ndarray, K2: np.ndarray, R: np.ndarray, t: np.ndarray
-) -> float:
-    """Share of matches near their epipolar lines."""
-    correspondences = np.hstack([normalize_points(points1, K1), normalize_points(points2, K2)])
-    distance = symmetric_epipolar_distance_squared(correspondences, essential_from_pose(R, t))
-    return float(np.mean(distance < INLIER_DISTANCE))
+    return RawPair(arguments, pair.attributes, pair.points1, pair.points2, pair.K1, pair.K2, pair.R, pair.t)
 
 
 def magsac(pair: RawPair, iterations: int) -> Any:
-    """The call that the filter replaces, at one pixel."""
+    """The call that the filter replaces, at one pixel: E and mask."""
     x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
     threshold = 1.0 / float(np.mean([pair.K1[0, 0], pair.K1[1, 1], pair.K2[0, 0], pair.K2[1, 1]]))
     return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, iterations)
+
+
+def answer_error_deg(pair: RawPair, answer: Any) -> float | None:
+    """Pose error of what a whole call returned, 180 without a pose; None where it returns no geometry at all."""
+    if isinstance(answer, FilterResult):
+        pose = None if answer.R is None else (answer.R, answer.t)
+    elif isinstance(answer, tuple):
+        E, mask = answer
+        pose = None if E is None else pose_from_essential(E[:3], pair.correspondences[mask.ravel() > 0])
+    else:
+        return None
+    return 180.0 if pose is None else pose_error_deg(*pose, pair.R, pair.t)
 
 
 def full_calls(pair: RawPair) -> dict[str, Callable[[], Any]]:
@@ -169,12 +183,17 @@ def median_ms(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, fl
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def print_ratios(title: str, times: dict[str, float]) -> None:
-    """Milliseconds, and each as a multiple of the first."""
+def print_ratios(title: str, times: dict[str, float], errors_deg: dict[str, float | None] | None = None) -> None:
+    """Milliseconds, each as a multiple of the first, and pose errors where they are given."""
     first = next(iter(times.values()))
-    print(f"\n{title}\n\n| | ms | ratio |\n|---|---:|---:|")
+    header = ["", "ms", "ratio", *([] if errors_deg is None else ["pose error"])]
+    print(f"\n{title}:\n\n| {' | '.join(header)} |\n|---|" + "---:|" * (len(header) - 1))
     for name, value in times.items():
-        print(f"| {name} | {value:.1f} | {value / first:.2f} |")
+        cells = [name, f"{value:.1f}", f"{value / first:.2f}"]
+        if errors_deg is not None:
+            error = errors_deg[name]
+            cells.append("–" if error is None else f"{error:.1f}°")
+        print(f"| {' | '.join(cells)} |")
 
 
 def run_alone(program: str, *arguments: object) -> list[float]:
@@ -186,7 +205,7 @@ def run_alone(program: str, *arguments: object) -> list[float]:
 def print_cold_start_and_memory(names: list[str]) -> None:
     """Seconds from import to the first answer, and how far the process grows at its peak."""
     counts = " | ".join(f"N = {count}" for count in MEMORY_COUNTS)
-    print("\nCold start (seconds; best of three) and growth of the process at its peak (MiB)\n")
+    print("\nCold start (seconds; best of three) and peak growth of the process, one pass over N matches (MiB):\n")
     print(f"| backend | import | first call | next call | {counts} |\n|---|" + "---:|" * (3 + len(MEMORY_COUNTS)))
     for name in names:
         start = min((run_alone(COLD_START, name) for _ in range(3)), key=lambda times: times[0] + times[1])
@@ -209,8 +228,11 @@ def main() -> None:
 
     torch.set_num_threads(options.threads)
     pair = bundle_pair(options.bundle, options.pair) if options.bundle else example_pair()
-    print(f"{len(pair.points1)} raw matches, {100 * pair.inlier_share:.0f} % right; {options.threads} threads")
-    print_ratios("Whole calls", median_ms(full_calls(pair), options.repeats))
+    threads = f"{options.threads} thread{'s' if options.threads > 1 else ''}"
+    print(f"{len(pair.points1)} raw matches, {100 * pair.inlier_share:.0f} % right; {threads}.")
+    calls = full_calls(pair)
+    errors_deg = {name: answer_error_deg(pair, call()) for name, call in calls.items()}
+    print_ratios("Whole calls", median_ms(calls, options.repeats), errors_deg)
     for count in (500, 2000):
         print_ratios(f"One pass of the network, N = {count}", median_ms(network_calls(count), options.repeats))
     print_cold_start_and_memory(["onnxruntime", "opencv", "torch"])

@@ -138,12 +138,13 @@ def print_costs(title: str, table: dict[str, Cost], rate: float) -> None:
 
 
 def main() -> None:
-    """Print the cost of each part and of each operator."""
+    """Print the cost of each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, nargs="?", default=mgca_filter.model_path())
     parser.add_argument("--count", type=int, default=2000, help="matches")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--operators", action="store_true", help="the most expensive operators as well")
     options = parser.parse_args()
     rate = gemm_rate(options.threads)
     events, run_ms = profile(options.model, options.count, options.threads, options.repeats)
@@ -152,8 +153,9 @@ def main() -> None:
         f"a large matrix product runs at {rate / 1e6:.0f} GFLOP/s"
     )
     print_costs("part (times with profiling on)", costs(events, options.repeats, by_part=True), rate)
-    operators = costs(events, options.repeats, by_part=False)
-    print_costs("operator", dict(list(operators.items())[:14]), rate)
+    if options.operators:
+        operators = costs(events, options.repeats, by_part=False)
+        print_costs("operator", dict(list(operators.items())[:14]), rate)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+from pages import fill
 
 from mgca_filter.evaluation.environment import BUSY_LOAD
 from mgca_filter.evaluation.figures import draw_figures
@@ -40,20 +41,6 @@ LABELS = {
 NOT_OPENCV = ("PoseLib", "DEGENSAC")
 
 
-class Section(NamedTuple):
-    """A generated part of a page, between ``<!-- name -->`` and ``<!-- /name -->``."""
-
-    name: str
-    text: str
-
-    def fill(self, content: str, where: str) -> str:
-        """``content`` with the text between its markers; ``where`` names it in the message when there are none."""
-        markers = re.compile(rf"(<!-- {self.name} -->\n).*?(<!-- /{self.name} -->)", re.DOTALL)
-        if not markers.search(content):
-            raise SystemExit(f"{where}: no {self.name} markers")
-        return markers.sub(lambda match: match[1] + self.text + match[2], content)
-
-
 def table(rows: list[dict[str, Any]], scene: str, columns: tuple[str, ...]) -> list[str]:
     """Markdown lines of one table: the rows of ``scene`` in their order."""
     lines = ["| | " + " | ".join(columns).replace("median_ms", "ms") + " |", "|---|" + "---:|" * len(columns)]
@@ -64,7 +51,7 @@ def table(rows: list[dict[str, Any]], scene: str, columns: tuple[str, ...]) -> l
     return lines
 
 
-def scoreboard(summary: dict[str, Any]) -> Section:
+def scoreboard(summary: dict[str, Any]) -> str:
     """Both tables with what has to be known to read them."""
     rows = summary["rows"]
     scenes = sorted({row["scene"] for row in rows} - {"all", "pairs"})
@@ -97,12 +84,11 @@ def scoreboard(summary: dict[str, Any]) -> Section:
         f"{caution} "
         f"Command: `{command}`; figures with bootstrap intervals, by scene: "
         "`docs/scoreboard.json`; curves and a picture: `docs/figures`; protocol and formats: `docs/evaluation.md`.",
-        "",
     ]
-    return Section("scoreboard", "\n".join(lines))
+    return "\n".join(lines)
 
 
-def difficulty(summary: dict[str, Any]) -> Section:
+def difficulty(summary: dict[str, Any]) -> str:
     """The filter by scene and difficulty of the pairs, beside the best row of OpenCV's and the best of all rivals."""
     opencv_rows = [row for row in summary["rows"] if not any(name in row["method"] for name in NOT_OPENCV)]
     rivals = dict.fromkeys(best_rival({"rows": rows}, "product") for rows in (opencv_rows, summary["rows"]))
@@ -123,7 +109,7 @@ def difficulty(summary: dict[str, Any]) -> Section:
     for entry in summary["difficulty"]:
         for group in entry["groups"]:
             add(f"{entry['property']} {group['group']}", group["pairs"], group["methods"])
-    return Section("difficulty", "\n".join([*lines, ""]))
+    return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -133,13 +119,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout to write to (default: this one)")
     options = parser.parse_args(arguments)
     summary = json.loads(options.scoreboard.read_text(encoding="utf-8"))
-    board = scoreboard(summary)
-    for name, sections in ((README, [board]), (MODEL_CARD, [board, difficulty(summary)])):
+    places = {"scoreboard": scoreboard(summary)}
+    for name, content in ((README, places), (MODEL_CARD, {**places, "difficulty": difficulty(summary)})):
         path = options.root / name
-        content = path.read_text(encoding="utf-8")
-        for section in sections:
-            content = section.fill(content, str(path))
-        path.write_text(content, encoding="utf-8")
+        page = path.read_text(encoding="utf-8")
+        for place, text in content.items():
+            page = fill(page, place, text, name)
+        path.write_text(page, encoding="utf-8")
     pictured = dict.fromkeys([RIVAL_ROWS[0], best_rival(summary, "product"), "product"])
     rows = [parse_method(name) for name in pictured]
     example = select_pairs(ROOT / EXAMPLE, data_format="pairs")

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
 import io
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import cv2
+from pages import fill, provenance
 
-from mgca_filter import model_path
 from mgca_filter.evaluation import detectors, focal_error, never_worse, score_promise, stress, verdicts
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -64,26 +61,6 @@ def run(study: Study, arguments: Sequence[str]) -> str:
     return output.getvalue().strip()
 
 
-def provenance() -> str:
-    """Which model and library gave the figures."""
-    path = model_path()
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return f"`{path.name}` {digest[:12]}, OpenCV {cv2.__version__}."
-
-
-def fill(page: str, name: str, content: str) -> str:
-    """The page with ``content`` between the comments ``<!-- name -->`` and ``<!-- /name -->``.
-
-    Raises:
-        ValueError: the page has no such place.
-    """
-    place = re.compile(rf"(<!-- {re.escape(name)} -->\n).*?(<!-- /{re.escape(name)} -->)", re.DOTALL)
-    filled, count = place.subn(lambda match: f"{match[1]}{content}\n{match[2]}", page)
-    if count != 1:
-        raise ValueError(f"{PAGE.name}: expected one place named {name}, found {count}")
-    return filled
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the studies that were asked for, all by default, and fill their places one by one."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -104,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.only or known:
         print(name, file=sys.stderr, flush=True)
         content = f"{run(*known[name])}\n\n{provenance()}"
-        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), name, content), encoding="utf-8")
+        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), name, content, PAGE.name), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 EXPORT = Path(__file__).parent.parent / "export"
+sys.path.append(str(EXPORT))  # the scripts import each other, as they can where they are run
 
 
 def load_export_module(name: str) -> ModuleType:

@@ -59,9 +59,9 @@ def test_every_study_takes_its_arguments_and_has_its_place(write_trust, capsys: 
     places = re.search(r"some of (.*), got nowhere", capsys.readouterr().err)[1].split(", ")
     assert sorted(places) == sorted(PLACES)
     for place in places:
-        write_trust.fill(page, place, "")
+        write_trust.fill(page, place, "", "trust.md")
     with pytest.raises(ValueError, match="nowhere"):
-        write_trust.fill(page, "nowhere", "")
+        write_trust.fill(page, "nowhere", "", "trust.md")
 
 
 def test_a_study_that_cannot_run_leaves_the_page_alone(write_trust, capsys: pytest.CaptureFixture[str]) -> None:

@@ -41,16 +41,16 @@ SUMMARY = {
 
 def test_rows_of_equal_time_are_explained():
     script = load_export_module("write_tables")
-    assert "as much time as the filter" not in script.scoreboard(SUMMARY).text
-    matched = script.scoreboard({**SUMMARY, "time_matched": [{"method": "x"}]}).text
+    assert "as much time as the filter" not in script.scoreboard(SUMMARY)
+    matched = script.scoreboard({**SUMMARY, "time_matched": [{"method": "x"}]})
     assert "as much time as the filter" in matched
     assert "`python -m mgca_filter.evaluation BUNDLES --seeds 3 --times 2 --time-matched product`" in matched
 
 
 def test_seeds_are_told():
     script = load_export_module("write_tables")
-    assert "averaged over 3 seeds" in script.scoreboard(SUMMARY).text
-    once = script.scoreboard({**SUMMARY, "settings": {"seeds": 1}}).text
+    assert "averaged over 3 seeds" in script.scoreboard(SUMMARY)
+    once = script.scoreboard({**SUMMARY, "settings": {"seeds": 1}})
     assert "run once" in once
     assert "--seeds 1 " in once
 
@@ -58,7 +58,7 @@ def test_seeds_are_told():
 def test_the_filter_stands_beside_the_strongest_rivals_by_scene_and_difficulty():
     script = load_export_module("write_tables")
     rows = [dict(row, **{"mAP@20": 62.0}) if "PoseLib" in row["method"] else row for row in SUMMARY["rows"]]
-    header, _, *lines = script.difficulty({**SUMMARY, "rows": rows}).text.splitlines()
+    header, _, *lines = script.difficulty({**SUMMARY, "rows": rows}).splitlines()
     assert header.endswith("| mAP@20, NN + MAGSAC 0.5 px | mAP@20, mutual + PoseLib 0.75 px |")
     assert lines == [
         "| scene `hall` | 3 | 50.0 | 61.3 | 61.3 | 62.0 |",
@@ -89,5 +89,5 @@ def test_tables_and_figures_are_written(tmp_path: Path):
     assert (tmp_path / script.FIGURES / "time_accuracy.svg").exists()
     assert (tmp_path / script.FIGURES / "courtyard_0.jpg").exists()
     (tmp_path / "README.md").write_text("no markers")
-    with pytest.raises(SystemExit, match=r"README\.md: no scoreboard markers"):
+    with pytest.raises(ValueError, match=r"README\.md: expected one place named scoreboard, found 0"):
         script.main([str(tmp_path / "board.json"), "--root", str(tmp_path)])
