@@ -96,3 +96,14 @@ def mean_focal_length(K1: ArrayLike, K2: ArrayLike) -> float:
     """Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane."""
     K1, K2 = np.asarray(K1, float), np.asarray(K2, float)
     return float((K1[0, 0] + K1[1, 1] + K2[0, 0] + K2[1, 1]) / 4.0)
+
+
+def distinct_rows(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Positions of the distinct rows of finite (N, D), ascending by value; of equal rows the first counts.
+
+    ``np.unique`` does the same for rows in several times the time.
+    """
+    ascending = np.lexsort(rows.T[::-1])  # stable: of equal rows the first stays first
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = np.any(rows[ascending[1:]] != rows[ascending[:-1]], axis=1)
+    return ascending[first]

@@ -19,6 +19,7 @@ from math import lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
+from .correspondences import distinct_rows
 from .epipolar import homogeneous, sampson_distance
 from .homography import homography_distance
 
@@ -54,7 +55,7 @@ class Support:
 
 def measure_support(correspondences: Array, M: Array, threshold: float) -> Support:
     """Support of a model among the matches (N, 4) that it was fitted to, all normalised."""
-    rows = np.unique(correspondences, axis=0)
+    rows = correspondences[distinct_rows(correspondences)]
     count = int(np.count_nonzero(sampson_distance(rows, M) < threshold))
     rate = chance_rate(rows, M, threshold)
     wrong = (len(rows) - count) / max(1.0 - rate, rate)
@@ -93,8 +94,9 @@ def line_distance(points: Array, threshold: float) -> Array:
     distance = np.zeros(len(points))
     for _ in range(_TRIM_ROUNDS):
         centre = points[near].mean(axis=0)
-        _, _, Vt = np.linalg.svd(points[near] - centre, full_matrices=False)
-        distance = np.abs((points - centre) @ Vt[1])
+        offsets = points[near] - centre
+        across = np.linalg.eigh(offsets.T @ offsets)[1][:, 0]  # of the smallest variance
+        distance = np.abs((points - centre) @ across)
         near = distance <= max(threshold, float(np.median(distance)))
     return distance
 

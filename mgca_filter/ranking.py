@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .correspondences import distinct_rows
 from .epipolar import essential_from_pose, sampson_distance, triangulated_depths
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class RankedMatches:
         Without scores all matches count alike and every start sees all of them. A match that is listed ten
         times is there once.
         """
-        order = order[_first_of_equals(correspondences[order])]
+        order = order[np.sort(distinct_rows(correspondences[order]))]
         ones = np.ones(len(correspondences))
         weights, margins = (ones if values is None else values for values in (weights, margins))
         return cls(
@@ -89,9 +90,3 @@ class RankedMatches:
 
     def _agreement(self, M: Array, threshold: float) -> Array:
         return 1.0 - np.minimum(sampson_distance(self.correspondences, M) / threshold, 1.0) ** 2
-
-
-def _first_of_equals(rows: Array) -> NDArray[np.intp]:
-    """Positions of the distinct rows in their order."""
-    _, first = np.unique(rows, axis=0, return_index=True)
-    return np.sort(first)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import degeneracy
+from .correspondences import distinct_rows
 from .epipolar import fundamental_from_essential, sampson_distance
 from .focal_check import better_focal_factor
 from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, homography_distance
@@ -82,7 +83,7 @@ def judge(
 
 def count_distinct(correspondences: Array) -> int:
     """Number of distinct rows of (N, 4)."""
-    return len(np.unique(correspondences, axis=0))
+    return len(distinct_rows(correspondences))
 
 
 def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, info: dict[str, Any]) -> Verdict:
