@@ -149,8 +149,8 @@ def main() -> None:
     rate = gemm_rate(options.threads)
     events, run_ms = profile(options.model, options.count, options.threads, options.repeats)
     print(
-        f"N = {options.count}, {options.threads} threads: {run_ms:.1f} ms a pass; "
-        f"a large matrix product runs at {rate / 1e6:.0f} GFLOP/s"
+        f"N = {options.count}, threads: {options.threads}. {run_ms:.1f} ms a pass; "
+        f"a large matrix product runs at {rate / 1e6:.0f} GFLOP/s."
     )
     print_costs("part (times with profiling on)", costs(events, options.repeats, by_part=True), rate)
     if options.operators:
