@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pages import fill, provenance
+from pages import fill_file, provenance
 
 FOLDER = Path(__file__).resolve().parent
 PAGE = FOLDER.parent / "docs" / "runtime.md"
@@ -29,11 +29,12 @@ def run(command: Sequence[str]) -> str:
     """What a command of this folder prints.
 
     Raises:
-        SystemExit: it failed; it has said why on standard error.
+        SystemExit: it failed; what it printed goes to standard error, where it has said why.
     """
     script, *arguments = command
     done = subprocess.run([sys.executable, str(FOLDER / script), *arguments], stdout=subprocess.PIPE, text=True)
     if done.returncode:
+        print(done.stdout, file=sys.stderr)
         raise SystemExit(done.returncode)
     return done.stdout.strip()
 
@@ -49,8 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if name == "parity" and options.bundles:
             command = (*command, "--bundles", str(options.bundles))
         print(name, file=sys.stderr, flush=True)
-        content = f"{run(command)}\n\n{provenance()}"
-        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), name, content, PAGE.name), encoding="utf-8")
+        fill_file(PAGE, {name: f"{run(command)}\n\n{provenance()}"})
 
 
 if __name__ == "__main__":

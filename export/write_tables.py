@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pages import fill
+from pages import fill_file
 
 from mgca_filter.evaluation.environment import BUSY_LOAD
 from mgca_filter.evaluation.figures import draw_figures
@@ -120,12 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     summary = json.loads(options.scoreboard.read_text(encoding="utf-8"))
     places = {"scoreboard": scoreboard(summary)}
-    for name, content in ((README, places), (MODEL_CARD, {**places, "difficulty": difficulty(summary)})):
-        path = options.root / name
-        page = path.read_text(encoding="utf-8")
-        for place, text in content.items():
-            page = fill(page, place, text, name)
-        path.write_text(page, encoding="utf-8")
+    fill_file(options.root / README, places)
+    fill_file(options.root / MODEL_CARD, {**places, "difficulty": difficulty(summary)})
     pictured = dict.fromkeys([RIVAL_ROWS[0], best_rival(summary, "product"), "product"])
     rows = [parse_method(name) for name in pictured]
     example = select_pairs(ROOT / EXAMPLE, data_format="pairs")

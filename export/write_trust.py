@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from pages import fill, provenance
+from pages import fill_file, provenance
 
 from mgca_filter.evaluation import detectors, focal_error, never_worse, score_promise, stress, verdicts
 
@@ -80,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         parser.error(f"--only: expected some of {', '.join(known)}, got {', '.join(unknown)}")
     for name in options.only or known:
         print(name, file=sys.stderr, flush=True)
-        content = f"{run(*known[name])}\n\n{provenance()}"
-        PAGE.write_text(fill(PAGE.read_text(encoding="utf-8"), name, content, PAGE.name), encoding="utf-8")
+        fill_file(PAGE, {name: f"{run(*known[name])}\n\n{provenance()}"})
 
 
 if __name__ == "__main__":

@@ -143,8 +143,7 @@ class MatchFilter:
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             ranked = self._rank(pair, job.sent, logits, scores)
-            proposal = None if job.output is None else job.output.essential
-            model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, proposal)
+            model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, job.network_essential)
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
             verdict = judge(pair, model, ranked, self.threshold, self.fit_options)
@@ -198,7 +197,7 @@ class MatchFilter:
             "intrinsics": "given" if job.pair.calibrated else "guessed",
             "assumptions": [camera.assumption for camera in cameras if camera.assumption],
             "num_network_matches": len(job.sent.rows),
-            "network_essential": None if job.output is None else job.output.essential,
+            "network_essential": job.network_essential,
         }
 
 
@@ -210,6 +209,11 @@ class _Job:
     sent: NetworkInput
     timings_ms: dict[str, float]
     output: NetworkOutput | None = None
+
+    @property
+    def network_essential(self) -> NDArray[np.float32] | None:
+        """The network's own E (3, 3), where it was asked."""
+        return None if self.output is None else self.output.essential
 
 
 def filter_matches(

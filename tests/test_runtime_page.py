@@ -47,6 +47,22 @@ def test_the_commands_exist_and_a_failure_ends_the_run(write_runtime) -> None:
         write_runtime.run(("floor.py", "missing.onnx"))
 
 
+def test_what_a_failing_command_printed_is_not_lost(write_runtime, tmp_path: Path, capfd, monkeypatch) -> None:
+    (tmp_path / "disagrees.py").write_text("print('| FAILED |')\nraise SystemExit(1)\n")
+    monkeypatch.setattr(write_runtime, "FOLDER", tmp_path)
+    with pytest.raises(SystemExit):
+        write_runtime.run(("disagrees.py",))
+    assert "| FAILED |" in capfd.readouterr().err
+
+
+def test_a_place_that_is_there_twice_stops_the_script(tmp_path: Path) -> None:
+    pages, page = load_export_module("pages"), tmp_path / "page.md"
+    page.write_text("<!-- a -->\n<!-- /a -->\n" * 2)
+    with pytest.raises(SystemExit, match=r"page\.md: 2 places named a, expected one"):
+        pages.fill_file(page, {"a": "new"})
+    assert "new" not in page.read_text()
+
+
 def test_errors_of_the_compared_answers() -> None:
     benchmark = load_export_module("benchmark")
     pair = benchmark.example_pair()

@@ -56,12 +56,13 @@ def test_every_study_takes_its_arguments_and_has_its_place(write_trust, capsys: 
     page = write_trust.PAGE.read_text(encoding="utf-8")
     with pytest.raises(SystemExit):
         write_trust.main([*ARGUMENTS, "--only", "nowhere"])
+    pages = load_export_module("pages")
     places = re.search(r"some of (.*), got nowhere", capsys.readouterr().err)[1].split(", ")
     assert sorted(places) == sorted(PLACES)
     for place in places:
-        write_trust.fill(page, place, "", "trust.md")
+        pages.fill(page, place, "")
     with pytest.raises(ValueError, match="nowhere"):
-        write_trust.fill(page, "nowhere", "", "trust.md")
+        pages.fill(page, "nowhere", "")
 
 
 def test_a_study_that_cannot_run_leaves_the_page_alone(write_trust, capsys: pytest.CaptureFixture[str]) -> None:

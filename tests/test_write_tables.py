@@ -89,5 +89,5 @@ def test_tables_and_figures_are_written(tmp_path: Path):
     assert (tmp_path / script.FIGURES / "time_accuracy.svg").exists()
     assert (tmp_path / script.FIGURES / "courtyard_0.jpg").exists()
     (tmp_path / "README.md").write_text("no markers")
-    with pytest.raises(ValueError, match=r"README\.md: expected one place named scoreboard, found 0"):
+    with pytest.raises(SystemExit, match=r"README\.md: no scoreboard markers"):
         script.main([str(tmp_path / "board.json"), "--root", str(tmp_path)])
