@@ -32,6 +32,12 @@ VARIANTS = {
 NETWORK_ORDER = "network order"
 """Part of a row's name: the estimator behind it gets the plain matches, best logit first."""
 
+ANSWER_PACKAGES = ("backends", "network")
+"""Folders of the package whose code decides what the filter answers."""
+
+OTHER_PACKAGES = ("evaluation", "integrations", "training")
+"""Folders of the package that only ask for answers; a test holds both lists against the tree."""
+
 BEST_SHARE = 0.1
 PAPER_THRESHOLD_NORM = 1e-3
 
@@ -211,11 +217,14 @@ def pose_by_paper_protocol(logits: FloatArray, x1: FloatArray, x2: FloatArray) -
 
 @lru_cache(maxsize=1)
 def runtime_source_digest() -> str:
-    """SHA-256 over the package's runtime sources, so that stored results of other code are not taken for its own."""
+    """SHA-256 over the sources that an answer depends on, so that results of other code are not taken for its own.
+
+    The modules of the package itself, and, however deep, those of :data:`ANSWER_PACKAGES`.
+    """
     package = Path(__file__).resolve().parent.parent
+    modules = [*package.glob("*.py"), *(path for name in ANSWER_PACKAGES for path in (package / name).rglob("*.py"))]
     digest = hashlib.sha256()
-    for folder in (package, package / "backends"):
-        for path in sorted(folder.glob("*.py")):
-            digest.update(path.name.encode())
-            digest.update(path.read_bytes())
+    for path in sorted(modules):
+        digest.update(path.relative_to(package).as_posix().encode())
+        digest.update(path.read_bytes())
     return digest.hexdigest()
