@@ -15,7 +15,7 @@ import numpy as np
 
 import mgca_filter
 from mgca_filter.drawing import MatchPanel, draw_before_after
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg
 
 ROOT = Path(__file__).parent.parent
 FOLDER = ROOT / "examples" / "images"

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 import mgca_filter
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg
 
 FOLDER = Path(__file__).parent / "images"
 

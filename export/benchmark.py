@@ -24,8 +24,8 @@ import numpy as np
 from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
 from mgca_filter.backends import open_backend
 from mgca_filter.backends.onnx_backend import THREADS_VARIABLE
-from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
 from mgca_filter.robust_fit import pose_from_essential
 from mgca_filter.scene_bundle import SceneBundle
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .correspondences import mean_focal_length
-from .epipolar import rotation_error_deg, sampson_distance
-from .intrinsics import resolve_intrinsics
+from .geometry.cameras import mean_focal_length, resolve_intrinsics
+from .geometry.epipolar import rotation_error_deg, sampson_distance
 from .ranking import RankedMatches
 from .result import FilterResult
 from .robust_fit import SINGLE_START, RobustFitOptions, estimate_model

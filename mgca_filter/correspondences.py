@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 ATTRIBUTE_COUNT = 8
 CANDIDATE_MAX_RATIO = 0.95
@@ -81,21 +81,6 @@ def candidate_mask(
     if len(hopeless) - np.count_nonzero(hopeless) < min_count:
         return np.ones(len(attributes), dtype=bool)
     return ~hopeless
-
-
-def normalize_points(points: ArrayLike, K: ArrayLike) -> NDArray[np.float64]:
-    """Pixels (N, 2), OpenCV's pixel centre, to the normalised image plane by K (3, 3); K may hold a skew."""
-    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-    K = np.asarray(K, dtype=np.float64)
-    y = (points[:, 1] - K[1, 2]) / K[1, 1]
-    x = (points[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    return np.stack([x, y], axis=1)
-
-
-def mean_focal_length(K1: ArrayLike, K2: ArrayLike) -> float:
-    """Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane."""
-    K1, K2 = np.asarray(K1, float), np.asarray(K2, float)
-    return float((K1[0, 0] + K1[1, 1] + K2[0, 0] + K2[1, 1]) / 4.0)
 
 
 def distinct_rows(rows: NDArray[np.float64]) -> NDArray[np.intp]:

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .correspondences import distinct_rows
-from .epipolar import homogeneous, sampson_distance
-from .homography import homography_distance
+from .geometry.epipolar import homogeneous, sampson_distance
+from .geometry.homography import homography_distance
 
 Array = NDArray[np.float64]
 

@@ -13,8 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import essential_from_pose, sampson_distance
-from .homography import usac_params
+from .geometry.epipolar import essential_from_pose, sampson_distance
+
+# A homography constrains both coordinates and planes are seldom perfect: it gets twice the threshold of E.
+HOMOGRAPHY_THRESHOLD_FACTOR = 2.0
+# With this local optimisation UsacParams returns, at seed 0, the very bits of OpenCV's USAC_PROSAC preset, which
+# cannot be seeded itself.
+_LO_ITERATIONS, _LO_SAMPLE_SIZE = 20, 12
+_CONFIDENCE, _MAX_ITERATIONS = 0.999, 1000
 
 Array = NDArray[np.float64]
 
@@ -134,3 +140,39 @@ def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibr
     if information.get("num_inliers", 0) == 0:
         return None
     return _best_of_stack(essential_from_pose(pose.R, pose.t), np.eye(3), rows, options.threshold_px / focal_px)
+
+
+def usac_params(
+    sampler: int, score: int, threshold: float, confidence: float, max_iterations: int, seed: int
+) -> cv2.UsacParams:
+    """OpenCV's estimator settings; ``sampler`` and ``score`` are ``cv2.SAMPLING_*`` and ``cv2.SCORE_METHOD_*``."""
+    params = cv2.UsacParams()
+    params.sampler, params.score = sampler, score
+    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
+    params.loIterations, params.loSampleSize = _LO_ITERATIONS, _LO_SAMPLE_SIZE
+    params.threshold, params.confidence = threshold, confidence
+    params.maxIterations, params.randomGeneratorState = max_iterations, seed % 2**31
+    return params
+
+
+def fit_homography(points1: Array, points2: Array, threshold: float, seed: int = 0) -> Array | None:
+    """Homography (3, 3) with ``p2 ~ H p1`` of points (N, 2), scaled to H[2, 2] = 1, or None.
+
+    Args:
+        threshold: transfer error of an inlier, in the unit of the points. seed: of the sampling.
+    """
+    if len(points1) < 4:
+        return None
+    # OpenCV holds some constants in pixels: in units of the threshold, any coordinates look like pixels to it.
+    scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
+    params = usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, 1.0, _CONFIDENCE, _MAX_ITERATIONS, seed)
+    try:
+        H, _ = cv2.findHomography(points1 / threshold, points2 / threshold, params)
+    except cv2.error:
+        return None
+    if H is None or np.shape(H) != (3, 3) or not np.isfinite(H).all():
+        return None
+    H = np.linalg.inv(scale) @ H @ scale
+    if abs(H[2, 2]) < 1e-12:
+        return None
+    return np.asarray(H / H[2, 2], dtype=np.float64)

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .correspondences import mean_focal_length
+from .geometry.cameras import mean_focal_length
 from .keypoints import read_keypoints
 from .match_filter import MatchFilter
 from .option_checks import check_integer, check_number

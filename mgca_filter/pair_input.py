@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .correspondences import MatchAttributes, mean_focal_length
-from .intrinsics import Intrinsics, resolve_intrinsics
+from .correspondences import MatchAttributes
+from .geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
 from .keypoints import Keypoints, read_keypoints
 from .matching import PutativeMatches, read_matches
 

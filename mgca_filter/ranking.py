@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .correspondences import distinct_rows
-from .epipolar import essential_from_pose, sampson_distance, triangulated_depths
+from .geometry.epipolar import essential_from_pose, sampson_distance, triangulated_depths
 
 Array = NDArray[np.float64]
 

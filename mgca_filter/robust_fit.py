@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import (
+from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
+from .geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
     pose_error_deg,
@@ -24,9 +25,8 @@ from .epipolar import (
     sampson_distance,
     triangulated_depths,
 )
-from .estimators import EstimatorOptions, fit_epipolar
-from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, poses_from_homography
-from .pose_refinement import refine_pose
+from .geometry.homography import poses_from_homography
+from .geometry.pose_refinement import refine_pose
 from .ranking import RankedMatches
 
 Array = NDArray[np.float64]

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from . import degeneracy
 from .correspondences import distinct_rows
-from .epipolar import fundamental_from_essential, sampson_distance
+from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography
 from .focal_check import better_focal_factor
-from .homography import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography, homography_distance
+from .geometry.epipolar import fundamental_from_essential, sampson_distance
+from .geometry.homography import homography_distance
 from .pair_input import PairInput
 from .ranking import RankedMatches
 from .result import Status

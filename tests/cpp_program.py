@@ -25,7 +25,7 @@ import pytest
 import mgca_filter
 from mgca_filter import FilterResult
 from mgca_filter.backends import OnnxBackend
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.matching import match_descriptors
 
 SOURCE = Path(__file__).parent.parent / "examples" / "cpp"

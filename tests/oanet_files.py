@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from conftest import K, Scene
 
-from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import symmetric_epipolar_distance_squared
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 
 h5py = pytest.importorskip("h5py")
 

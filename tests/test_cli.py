@@ -14,7 +14,7 @@ import pytest
 
 import mgca_filter
 from mgca_filter import cli
-from mgca_filter.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
 ROOT = Path(__file__).parent.parent
 IMAGES = ROOT / "examples" / "images"

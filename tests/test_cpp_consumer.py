@@ -32,7 +32,7 @@ from cpp_program import (
 )
 
 import mgca_filter
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.keypoints import create_detector, detect_keypoints
 
 IMAGES = Path(__file__).parent.parent / "examples" / "images"

@@ -19,8 +19,8 @@ from cpp_program import BUILD_TIMEOUT, SOURCE, Pair, assert_same_answer, build, 
 
 import mgca_filter
 from mgca_filter import robust_fit
-from mgca_filter.epipolar import essential_from_pose, pose_error_deg
-from mgca_filter.pose_refinement import refine_pose, rotation_from_vector
+from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
+from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector
 from mgca_filter.ranking import RankedMatches, match_order
 
 pytestmark = BUILD_TIMEOUT

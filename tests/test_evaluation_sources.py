@@ -12,7 +12,6 @@ from conftest import SIZE, K, make_scene
 from oanet_files import write_oanet
 from scene_bundles import write_bundle
 
-from mgca_filter.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
 from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation.baselines import Rival
 from mgca_filter.evaluation.estimators import OpenCvEstimator
@@ -23,8 +22,9 @@ from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.sources import open_sources
 from mgca_filter.evaluation.sources.colmap import covisible_pairs
 from mgca_filter.evaluation.sources.pair_lists import turn_camera
+from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.image_matching import match_images
-from mgca_filter.pose_refinement import rotation_from_vector
 
 PROSAC = "mutual + ratio 0.9 + PROSAC 0.5 px"
 R_TRUE = rotation_from_vector(np.array([0.02, -0.08, 0.03]))

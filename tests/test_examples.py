@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import essential_from_pose, sampson_distance
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import essential_from_pose, sampson_distance
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 

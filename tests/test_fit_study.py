@@ -10,10 +10,10 @@ from conftest import make_scene
 from scene_bundles import write_bundle
 
 from mgca_filter import MatchFilter
-from mgca_filter.epipolar import pose_error_deg
 from mgca_filter.evaluation.fit_study import AS_IT_IS, VARIANTS, ScoredPair, Variant, format_study, main
 from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.product import filter_pair
+from mgca_filter.geometry.epipolar import pose_error_deg
 
 
 @pytest.fixture

@@ -10,11 +10,11 @@ import pytest
 from conftest import K, Scene, make_scene
 
 from mgca_filter import robust_fit
-from mgca_filter.correspondences import normalize_points
-from mgca_filter.epipolar import cross_matrix, essential_from_pose, pose_error_deg
-from mgca_filter.estimators import METHODS, fit_epipolar
-from mgca_filter.homography import fit_homography, homography_distance, poses_from_homography, usac_params
-from mgca_filter.pose_refinement import refine_pose, rotation_from_vector, truncated_cost
+from mgca_filter.estimators import METHODS, fit_epipolar, fit_homography, usac_params
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import cross_matrix, essential_from_pose, pose_error_deg
+from mgca_filter.geometry.homography import homography_distance, poses_from_homography
+from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector, truncated_cost
 from mgca_filter.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
 from mgca_filter.robust_fit import (
     SINGLE_START,

@@ -11,7 +11,7 @@ import pytest
 from export_tools import EXPORT, load_export_module
 
 import mgca_filter
-from mgca_filter.epipolar import essential_from_pose
+from mgca_filter.geometry.epipolar import essential_from_pose
 
 ROOT = Path(__file__).parent.parent
 

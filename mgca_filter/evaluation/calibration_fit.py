@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..calibration import Calibration, sigmoid
-from ..epipolar import symmetric_epipolar_distance_squared
+from ..geometry.epipolar import symmetric_epipolar_distance_squared
 from ..match_filter import MatchFilter
 from ..scene_bundle import ScenePair
 from .methods import BoolArray, FloatArray

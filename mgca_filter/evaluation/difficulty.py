@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correspondences import candidate_mask
-from ..epipolar import homogeneous
+from ..geometry.epipolar import homogeneous
 from ..scene_bundle import ScenePair
 from .metrics import POSE_STATISTICS, SceneErrors, pool_pairs
 

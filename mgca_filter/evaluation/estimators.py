@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Protocol
 import cv2
 import numpy as np
 
-from ..correspondences import mean_focal_length, normalize_points
-from ..epipolar import project_to_essential
+from ..geometry.cameras import mean_focal_length, normalize_points
+from ..geometry.epipolar import project_to_essential
 from ..scene_bundle import ScenePair
 from .methods import MIN_MATCHES, BoolArray, FloatArray, PoseEstimate
 

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar import pose_error_deg, sampson_distance, symmetric_epipolar_distance_squared
 from ..errors import MgcaFilterError
+from ..geometry.epipolar import pose_error_deg, sampson_distance, symmetric_epipolar_distance_squared
 from ..match_filter import MatchFilter, model_path
 from ..pair_input import MatchPair
 from ..result import Status

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from ..pose_refinement import rotation_from_vector
+from ..geometry.pose_refinement import rotation_from_vector
 
 Array = NDArray[np.float64]
 Points = tuple[Array, Array]

@@ -11,8 +11,8 @@ from multiprocessing import get_context
 
 import numpy as np
 
-from ..epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
 from ..errors import DatasetError
+from ..geometry.epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
 from ..scene_bundle import ScenePair
 from .difficulty import PairProperties
 from .environment import one_thread

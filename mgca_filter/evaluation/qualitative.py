@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 
 from ..drawing import MatchPanel, draw_matches
-from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..errors import DatasetError
+from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..scene_bundle import ScenePair
 from .methods import Method
 from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 
-from ..epipolar import pose_error_deg
+from ..geometry.epipolar import pose_error_deg
 from ..match_filter import MatchFilter
 from ..pair_input import MatchPair
 from ..result import FilterResult

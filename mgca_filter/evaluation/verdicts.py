@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar import decompose_essential, pose_error_deg
 from ..errors import MgcaFilterError
+from ..geometry.epipolar import decompose_essential, pose_error_deg
 from ..match_filter import MatchFilter, model_path
 from ..pair_input import MatchPair
 from ..result import Status

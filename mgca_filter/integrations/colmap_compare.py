@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from ..epipolar import pose_error_deg
+from ..geometry.epipolar import pose_error_deg
 from .colmap import copy_database, open_database
 from .journal import PipelineError
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..correspondences import MatchAttributes
-from ..epipolar import essential_from_pose
+from ..geometry.epipolar import essential_from_pose
 from .labels import clean_labels
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..epipolar import homogeneous, symmetric_epipolar_distance_squared
+from ..geometry.epipolar import homogeneous, symmetric_epipolar_distance_squared
 from .augmentation import (
     AugmentationConfig,
     draw_homographies,

@@ -11,8 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from ..calibration import sigmoid
-from ..correspondences import candidate_mask, mean_focal_length
-from ..epipolar import pose_error_deg, symmetric_epipolar_distance_squared
+from ..correspondences import candidate_mask
 from ..evaluation.metrics import (
     FAILURE_DEG,
     TRUE_INLIER_DISTANCE_SQUARED,
@@ -20,6 +19,8 @@ from ..evaluation.metrics import (
     mean_average_precision,
     precision_recall_f,
 )
+from ..geometry.cameras import mean_focal_length
+from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..network import MGCANet
 from ..ranking import RankedMatches, match_order
 from ..robust_fit import estimate_pose, pose_from_essential

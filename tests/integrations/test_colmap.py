@@ -11,7 +11,7 @@ import pytest
 from pipeline_command import assert_one_line
 
 from mgca_filter import cli
-from mgca_filter.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
 pycolmap = pytest.importorskip("pycolmap")
 from mgca_filter.integrations import colmap  # noqa: E402

@@ -17,7 +17,7 @@ from conftest import METADATA, build_model
 from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
-from mgca_filter.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.integrations.folder import FolderJob
 from mgca_filter.integrations.folder_pairs import exhaustive_pairs, sequential_pairs
 

@@ -8,15 +8,15 @@ import torch
 from networks import sign_free_difference
 from torch import Tensor
 
-from mgca_filter import epipolar
-from mgca_filter.epipolar import essential_from_pose
+from mgca_filter.geometry import epipolar
+from mgca_filter.geometry.epipolar import essential_from_pose
+from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.network.eight_point import (
     residual_channel,
     smallest_eigenvector,
     symmetric_epipolar_distance_squared,
     weighted_eight_point,
 )
-from mgca_filter.pose_refinement import rotation_from_vector
 
 
 def views(count: int, seed: int = 0, noise: float = 0.0) -> tuple[Tensor, np.ndarray]:

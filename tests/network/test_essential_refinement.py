@@ -8,10 +8,10 @@ import torch
 from networks import sign_free_difference
 from torch import Tensor
 
-from mgca_filter.epipolar import essential_from_pose
+from mgca_filter.geometry.epipolar import essential_from_pose
+from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.network.eight_point import weighted_eight_point
 from mgca_filter.network.essential_refinement import refine_essential
-from mgca_filter.pose_refinement import rotation_from_vector
 
 WRONG = 40
 

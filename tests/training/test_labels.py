@@ -9,7 +9,7 @@ import pytest
 from conftest import SIZE, K, make_scene
 
 from mgca_filter.correspondences import MatchAttributes
-from mgca_filter.epipolar import symmetric_epipolar_distance_squared
+from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.scene_bundle import ScenePair
 from mgca_filter.training.labels import IGNORED, NEGATIVE, POSITIVE, clean_labels
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from photographs import write_photographs
 
-from mgca_filter.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
 from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.training.bundle_writer import LABEL_FIELD
 from mgca_filter.training.labels import NEGATIVE, POSITIVE

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...epipolar import essential_from_pose
 from ...errors import DatasetError
+from ...geometry.epipolar import essential_from_pose
 from ...oanet_hdf5 import OanetFile
 from ..labels import epipolar_labels
 from ..pairs import TrainingPair

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...epipolar import homogeneous
+from ...geometry.epipolar import homogeneous
 from ..augmentation import rotation_matrix
 from .world import World
 

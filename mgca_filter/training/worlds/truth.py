@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...epipolar import symmetric_epipolar_distance_squared
+from ...geometry.epipolar import symmetric_epipolar_distance_squared
 from ..labels import IGNORED, NEGATIVE, NEGATIVE_DISTANCE, POSITIVE, POSITIVE_DISTANCE
 from .cameras import Camera
 from .visibility import NOTHING, VisibilityMap

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...correspondences import normalize_points
-from ...epipolar import essential_from_pose
+from ...geometry.cameras import normalize_points
+from ...geometry.epipolar import essential_from_pose
 from ..bundle_writer import BundleImage, BundlePair
 from ..labels import POSITIVE
 from ..sift import OneWayMatches, match_one_way

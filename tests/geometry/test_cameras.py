@@ -8,7 +8,7 @@ import pytest
 from conftest import K, make_scene
 
 from mgca_filter import MatchFilter, Status
-from mgca_filter.intrinsics import resolve_intrinsics
+from mgca_filter.geometry.cameras import resolve_intrinsics
 
 WIDE = np.array([[800.0, 0.0, 639.5], [0.0, 810.0, 479.5], [0.0, 0.0, 1.0]])
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mgca_filter import epipolar
-from mgca_filter.pose_refinement import rotation_from_vector
+from mgca_filter.geometry import epipolar
+from mgca_filter.geometry.pose_refinement import rotation_from_vector
 
 vectors = st.tuples(*[st.floats(-1, 1)] * 3).map(np.array)
 poses = st.tuples(vectors, vectors.filter(lambda v: np.linalg.norm(v) > 0.1))

@@ -7,9 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .correspondences import normalize_points
 from .epipolar import homogeneous
 
 GUESSED_FOCAL_FACTOR = 1.2
@@ -156,3 +155,18 @@ def _read_size(value: Any, name: str) -> tuple[float, float] | None:
     if size.shape != (2,) or (size < 1).any():
         raise ValueError(f"{name}: expected (width, height) of at least one pixel each, got {value!r}")
     return float(size[0]), float(size[1])
+
+
+def normalize_points(points: ArrayLike, K: ArrayLike) -> NDArray[np.float64]:
+    """Pixels (N, 2), OpenCV's pixel centre, to the normalised image plane by K (3, 3); K may hold a skew."""
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
+    K = np.asarray(K, dtype=np.float64)
+    y = (points[:, 1] - K[1, 2]) / K[1, 1]
+    x = (points[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    return np.stack([x, y], axis=1)
+
+
+def mean_focal_length(K1: ArrayLike, K2: ArrayLike) -> float:
+    """Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane."""
+    K1, K2 = np.asarray(K1, float), np.asarray(K2, float)
+    return float((K1[0, 0] + K1[1, 1] + K2[0, 0] + K2[1, 1]) / 4.0)
