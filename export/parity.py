@@ -20,7 +20,7 @@ import numpy as np
 import mgca_filter
 from mgca_filter import BackendError
 from mgca_filter.backends import Backend, open_backend
-from mgca_filter.pair_input import MatchPair, prepare_pair
+from mgca_filter.inputs.pair import MatchPair, prepare_pair
 from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.scoring import select_network_input
 

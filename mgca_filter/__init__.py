@@ -5,13 +5,13 @@ best of them and re-tests every match against it. Importing the package loads ne
 Matplotlib; ONNX Runtime is loaded when the first model is opened.
 """
 
-from .correspondences import MatchAttributes
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
 from .image_matching import ImageMatchResult, match_images
+from .inputs.attributes import MatchAttributes
+from .inputs.pair import MatchPair
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
 from .opencv_api import findEssentialMat, findFundamentalMat, matchMGCA
 from .opencv_patch import patch_cv2
-from .pair_input import MatchPair
 from .result import FilterResult, Status
 
 __version__ = "0.1.0"

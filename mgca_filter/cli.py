@@ -28,9 +28,9 @@ from .cli_output import MatchReport, picture, summary, to_json, write_npz
 from .comparison import BaselineFit, comparison_table, fit_baselines
 from .errors import MgcaFilterError
 from .estimators import METHODS
+from .features import DETECTORS
 from .image_file import decode_image
 from .image_matching import match_images
-from .keypoints import DETECTORS
 
 SUBCOMMANDS = ("colmap", "hloc", "folder")
 _EPILOG = """\

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .keypoints import SIFT_FEATURE_COUNT, create_detector, detect_keypoints
+from .features import SIFT_FEATURE_COUNT, create_detector, detect_keypoints, match_descriptors
 from .match_filter import filter_matches
-from .matching import match_descriptors
 from .result import FilterResult
 
 

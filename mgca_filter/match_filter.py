@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from .backends import BACKENDS, Providers, shared_backend
 from .calibration import largest_set_of_precision
-from .correspondences import MatchAttributes
 from .estimators import METHODS
-from .option_checks import check_choice, check_integer, check_number, check_path, check_providers
-from .pair_input import MatchPair, PairInput, prepare_pair
+from .inputs.attributes import MatchAttributes
+from .inputs.options import check_choice, check_integer, check_number, check_path, check_providers
+from .inputs.pair import MatchPair, PairInput, prepare_pair
 from .ranking import RankedMatches, match_order
 from .result import FilterResult, Status
 from .robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model

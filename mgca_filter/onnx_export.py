@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from .backends.base import INPUT_NAMES, OUTPUT_NAMES
 from .backends.metadata import CONTRACT_VERSION, METADATA_KEYS
 from .calibration import Calibration
-from .correspondences import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
+from .inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from .network import MGCANet, save_network
 from .network.config import ATTRIBUTE_CHANNELS
 from .network.graph import AnnularConvolution

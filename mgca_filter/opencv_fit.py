@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .geometry.cameras import mean_focal_length
-from .keypoints import read_keypoints
+from .inputs.keypoints import read_keypoints
+from .inputs.options import check_integer, check_number
+from .inputs.pair import MatchPair
 from .match_filter import MatchFilter
-from .option_checks import check_integer, check_number
-from .pair_input import MatchPair
 from .result import FilterResult
 
 Array = NDArray[np.float64]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .correspondences import distinct_rows
 from .geometry.epipolar import essential_from_pose, sampson_distance, triangulated_depths
 
 Array = NDArray[np.float64]
@@ -90,3 +89,14 @@ class RankedMatches:
 
     def _agreement(self, M: Array, threshold: float) -> Array:
         return 1.0 - np.minimum(sampson_distance(self.correspondences, M) / threshold, 1.0) ** 2
+
+
+def distinct_rows(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Positions of the distinct rows of finite (N, D), ascending by value; of equal rows the first counts.
+
+    ``np.unique`` does the same for rows in several times the time.
+    """
+    ascending = np.lexsort(rows.T[::-1])  # stable: of equal rows the first stays first
+    first = np.ones(len(rows), dtype=bool)
+    first[1:] = np.any(rows[ascending[1:]] != rows[ascending[:-1]], axis=1)
+    return ascending[first]

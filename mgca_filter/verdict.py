@@ -9,13 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import degeneracy
-from .correspondences import distinct_rows
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography
 from .focal_check import better_focal_factor
 from .geometry.epipolar import fundamental_from_essential, sampson_distance
 from .geometry.homography import homography_distance
-from .pair_input import PairInput
-from .ranking import RankedMatches
+from .inputs.pair import PairInput
+from .ranking import RankedMatches, distinct_rows
 from .result import Status
 from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model
 

@@ -14,9 +14,9 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from mgca_filter import MatchFilter
-from mgca_filter.correspondences import MatchAttributes
 from mgca_filter.geometry.epipolar import essential_from_pose
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
+from mgca_filter.inputs.attributes import MatchAttributes
 
 K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)

@@ -11,8 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mgca_filter.keypoints import create_detector, detect_keypoints
-from mgca_filter.matching import match_descriptors
+from mgca_filter.features import create_detector, detect_keypoints, match_descriptors
 
 
 def _load_example():

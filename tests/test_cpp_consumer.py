@@ -32,8 +32,8 @@ from cpp_program import (
 )
 
 import mgca_filter
+from mgca_filter.features import create_detector, detect_keypoints
 from mgca_filter.geometry.epipolar import pose_error_deg
-from mgca_filter.keypoints import create_detector, detect_keypoints
 
 IMAGES = Path(__file__).parent.parent / "examples" / "images"
 K2 = np.array([[700.0, 0.0, 310.0], [0.0, 710.0, 250.0], [0.0, 0.0, 1.0]])

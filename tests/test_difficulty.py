@@ -9,7 +9,6 @@ import pytest
 from conftest import make_scene
 from scene_bundles import write_bundle
 
-from mgca_filter.correspondences import candidate_mask
 from mgca_filter.evaluation.difficulty import (
     GROUPINGS,
     UNKNOWN,
@@ -24,6 +23,7 @@ from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.summary import summarize
+from mgca_filter.inputs.attributes import candidate_mask
 from mgca_filter.scene_bundle import SceneBundle, ScenePair
 
 

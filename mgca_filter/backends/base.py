@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import ATTRIBUTE_COUNT
 from ..errors import BackendError, ModelError
+from ..inputs.attributes import ATTRIBUTE_COUNT
 from .metadata import ModelMetadata
 
 Float32Array = NDArray[np.float32]

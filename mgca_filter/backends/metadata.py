@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..calibration import AttributePrior, Calibration
-from ..correspondences import ATTRIBUTE_COUNT
 from ..errors import ModelError
+from ..inputs.attributes import ATTRIBUTE_COUNT
 from .checksums import check_checksum, sha256_of
 
 CONTRACT_VERSION = "1"

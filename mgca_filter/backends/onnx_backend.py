@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Any
 
 from ..errors import BackendError, ModelError
 from .base import OUTPUT_NAMES, Float32Array, check_input, check_names
@@ -16,7 +15,6 @@ from .onnx_file import read_onnx_file
 if TYPE_CHECKING:
     import onnxruntime
 
-Providers = Sequence[Union[str, "tuple[str, dict[str, Any]]"]]
 
 CPU_PROVIDER = "CPUExecutionProvider"
 # What ONNX Runtime raises for a file that is damaged or no ONNX model; anything else is the runtime's fault.

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from ..errors import MgcaFilterError
-from ..keypoints import create_detector
+from ..features import create_detector
 from ..scene_bundle import SceneBundle, ScenePair
 from .image_sets import ImageSet, photographed, rendered
 from .metrics import POSE_STATISTICS, FloatArray

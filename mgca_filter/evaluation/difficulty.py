@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import candidate_mask
 from ..geometry.epipolar import homogeneous
+from ..inputs.attributes import candidate_mask
 from ..scene_bundle import ScenePair
 from .metrics import POSE_STATISTICS, SceneErrors, pool_pairs
 

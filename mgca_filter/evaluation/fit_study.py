@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ..correspondences import candidate_mask
 from ..errors import MgcaFilterError
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg
+from ..inputs.attributes import candidate_mask
 from ..match_filter import MatchFilter
 from ..ranking import RankedMatches, match_order
 from ..robust_fit import SINGLE_START, RobustFitOptions, Start, estimate_pose

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
-from ..correspondences import MatchAttributes
-from ..pair_input import MatchPair
+from ..inputs.attributes import MatchAttributes
+from ..inputs.pair import MatchPair
 from .sources.base import digest_files
 from .sources.image_features import FEATURE_SETTINGS, detect, match_features
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
 from ..geometry.cameras import normalize_points
+from ..inputs.attributes import MatchAttributes
 from ..result import FilterResult
 from ..scene_bundle import ScenePair
 from .baselines import REVISION
@@ -33,7 +33,7 @@ VARIANTS = {
 NETWORK_ORDER = "network order"
 """Part of a row's name: the estimator behind it gets the plain matches, best logit first."""
 
-ANSWER_PACKAGES = ("backends", "geometry", "network")
+ANSWER_PACKAGES = ("backends", "geometry", "inputs", "network")
 """Folders of the package whose code decides what the filter answers."""
 
 OTHER_PACKAGES = ("evaluation", "integrations", "training")

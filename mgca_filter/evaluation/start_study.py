@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import cv2
 
 from ..geometry.epipolar import pose_error_deg
+from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
-from ..pair_input import MatchPair
 from ..result import FilterResult
 from ..scene_bundle import ScenePair
 from .metrics import FAILURE_DEG, mean_average_precision

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from ..errors import MgcaFilterError
 from ..geometry.epipolar import decompose_essential, pose_error_deg
+from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter, model_path
-from ..pair_input import MatchPair
 from ..result import Status
 from ..scene_bundle import load_scene_bundles
 from .metrics import FAILURE_DEG

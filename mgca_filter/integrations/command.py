@@ -21,7 +21,7 @@ from ..cli_arguments import (
 )
 from ..errors import MgcaFilterError
 from ..estimators import METHODS
-from ..keypoints import DETECTORS
+from ..features import DETECTORS
 from .pair_job import EngineOptions, Summary
 
 _EPILOG = """\

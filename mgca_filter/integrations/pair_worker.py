@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
+from ..features import create_detector, detect_keypoints, match_descriptors
 from ..image_file import decode_image
-from ..keypoints import create_detector, detect_keypoints
+from ..inputs.attributes import MatchAttributes, best_of_list, distance_ratio
 from ..match_filter import MatchFilter
-from ..matching import best_of_list, distance_ratio, match_descriptors
 from ..result import FilterResult, Status
 
 FAILED = "failed"

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
+from ..inputs.attributes import MatchAttributes
 from ..scene_bundle import ScenePair
 
 InputList = tuple[NDArray[np.intp], MatchAttributes]

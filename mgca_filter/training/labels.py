@@ -7,8 +7,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
 from ..geometry.epipolar import symmetric_epipolar_distance_squared, triangulated_depths
+from ..inputs.attributes import MatchAttributes
 
 POSITIVE_DISTANCE = 1.5e-5  # squared symmetric epipolar distance, normalised coordinates
 NEGATIVE_DISTANCE = 1e-4  # the field's threshold

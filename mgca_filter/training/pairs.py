@@ -8,8 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
 from ..geometry.epipolar import essential_from_pose
+from ..inputs.attributes import MatchAttributes
 from .labels import clean_labels
 
 FloatArray = NDArray[np.float64]

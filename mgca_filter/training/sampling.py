@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import candidate_mask
+from ..inputs.attributes import candidate_mask
 from .pairs import TrainingPair
 
 Regime = Literal["candidates", "filtered", "bare"]

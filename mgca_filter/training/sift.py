@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correspondences import MatchAttributes
-from ..keypoints import create_detector, detect_keypoints, read_keypoints
-from ..matching import best_of_list, distance_ratio
+from ..features import create_detector, detect_keypoints
+from ..inputs.attributes import MatchAttributes, best_of_list, distance_ratio
+from ..inputs.keypoints import read_keypoints
 
 
 @dataclass(frozen=True)

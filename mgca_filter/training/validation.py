@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 
 from ..calibration import sigmoid
-from ..correspondences import candidate_mask
 from ..evaluation.metrics import (
     FAILURE_DEG,
     TRUE_INLIER_DISTANCE_SQUARED,
@@ -21,6 +20,7 @@ from ..evaluation.metrics import (
 )
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
+from ..inputs.attributes import candidate_mask
 from ..network import MGCANet
 from ..ranking import RankedMatches, match_order
 from ..robust_fit import estimate_pose, pose_from_essential

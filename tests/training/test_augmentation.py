@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from conftest import make_scene
 
-from mgca_filter.correspondences import MatchAttributes
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from mgca_filter.inputs.attributes import MatchAttributes
 from mgca_filter.training.augmentation import (
     AugmentationConfig,
     draw_homographies,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import SIZE, K, make_scene
 
-from mgca_filter.correspondences import MatchAttributes
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
+from mgca_filter.inputs.attributes import MatchAttributes
 from mgca_filter.scene_bundle import ScenePair
 from mgca_filter.training.labels import IGNORED, NEGATIVE, POSITIVE, clean_labels
 

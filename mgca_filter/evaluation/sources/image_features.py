@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...correspondences import MatchAttributes
-from ...keypoints import create_detector, detect_keypoints
-from ...matching import match_descriptors, read_matches
+from ...features import create_detector, detect_keypoints, match_descriptors
+from ...inputs.attributes import MatchAttributes
+from ...inputs.matches import read_matches
 from ...scene_bundle import ScenePair
 from .base import Image, read_image
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...correspondences import MatchAttributes
 from ...geometry.cameras import normalize_points
 from ...geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
+from ...inputs.attributes import MatchAttributes
 from ..labels import IGNORED, NEGATIVE, NEGATIVE_DISTANCE, POSITIVE, POSITIVE_DISTANCE
 from ..match_statistics import Difficulty, MatchStatistics
 from ..pairs import TrainingPair

@@ -8,7 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgca_filter.matching import best_of_list, distance_ratio, match_descriptors, read_matches
+from mgca_filter.features import match_descriptors
+from mgca_filter.inputs.attributes import best_of_list, distance_ratio
+from mgca_filter.inputs.matches import read_matches
 
 DMATCHES = [cv2.DMatch(0, 2, 5.0), cv2.DMatch(1, 2, 3.0), cv2.DMatch(2, 0, 4.0)]
 KNN = [(cv2.DMatch(0, 1, 2.0), cv2.DMatch(0, 2, 4.0)), (cv2.DMatch(1, 1, 3.0),), ()]

@@ -11,6 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .attributes import best_of_list, distance_ratio
+
 # OpenCV's default of DMatch.distance is the largest float: "no distance was set".
 _NO_DISTANCE = 1e38
 
@@ -149,56 +151,3 @@ def _check_range(index1: NDArray[np.intp], index2: NDArray[np.intp], count1: int
             raise ValueError(
                 f"{name}: index {index[wrong][0]} is out of range for the {count} keypoints of image {image}"
             )
-
-
-def distance_ratio(nearest: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Ratio (M,) of nearest to second nearest descriptor distance, 0 … 1; NaN where one is NaN.
-
-    Two candidates at distance zero cannot be told apart: their ratio is 1.
-    """
-    known = np.isfinite(nearest) & np.isfinite(second)
-    ambiguous = known & (second <= 0)
-    with np.errstate(over="ignore"):
-        ratio = np.divide(nearest, second, out=np.full(len(nearest), np.nan), where=known & ~ambiguous)
-    return np.where(ambiguous, 1.0, np.clip(ratio, 0.0, 1.0)).astype(np.float32)
-
-
-def best_of_list(index2: NDArray[np.intp], distance: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-    """True (M,) where no other match reaches the same keypoint of image 2 at a smaller distance.
-
-    Returns None where the distances say nothing: some are missing, or several matches all have the same.
-    """
-    present = index2 >= 0
-    known = distance[present]
-    if not present.any() or not np.isfinite(known).all() or (len(known) > 1 and np.ptp(known) == 0):
-        return None
-    smallest = np.full(int(index2.max()) + 1, np.inf)
-    np.minimum.at(smallest, index2[present], known)
-    best = np.zeros(len(index2), dtype=bool)
-    best[present] = known <= smallest[index2[present]]
-    return best
-
-
-def match_descriptors(
-    descriptors1: NDArray[Any], descriptors2: NDArray[Any], norm: int | None = None
-) -> tuple[tuple[cv2.DMatch, ...], ...]:
-    """Two nearest neighbours in image 2 of every descriptor of image 1, as ``knnMatch`` returns them.
-
-    Args:
-        descriptors1, descriptors2: (N, D), of the same dtype. Without descriptors on either side there are no
-            matches.
-        norm: ``cv2.NORM_*``; None = Hamming distance for uint8, Euclidean distance for all others.
-
-    Raises:
-        ValueError: the two descriptor arrays differ in dtype or length D.
-    """
-    if len(descriptors1) == 0 or len(descriptors2) == 0:
-        return ()
-    if descriptors1.dtype != descriptors2.dtype or descriptors1.shape[1:] != descriptors2.shape[1:]:
-        raise ValueError(
-            f"descriptors2: expected {descriptors1.dtype} of length {descriptors1.shape[1:]} like descriptors1, "
-            f"got {descriptors2.dtype} of length {descriptors2.shape[1:]}"
-        )
-    if norm is None:
-        norm = cv2.NORM_HAMMING if descriptors1.dtype == np.uint8 else cv2.NORM_L2
-    return tuple(tuple(row) for row in cv2.BFMatcher(norm).knnMatch(descriptors1, descriptors2, k=2))

@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mgca_filter.keypoints import create_detector, detect_keypoints, read_keypoints
+from mgca_filter.features import create_detector, detect_keypoints
+from mgca_filter.inputs.keypoints import read_keypoints
 
 
 def test_keypoint_sequence_keeps_position_size_and_angle() -> None:

@@ -83,12 +83,29 @@ def candidate_mask(
     return ~hopeless
 
 
-def distinct_rows(rows: NDArray[np.float64]) -> NDArray[np.intp]:
-    """Positions of the distinct rows of finite (N, D), ascending by value; of equal rows the first counts.
+def distance_ratio(nearest: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Ratio (M,) of nearest to second nearest descriptor distance, 0 … 1; NaN where one is NaN.
 
-    ``np.unique`` does the same for rows in several times the time.
+    Two candidates at distance zero cannot be told apart: their ratio is 1.
     """
-    ascending = np.lexsort(rows.T[::-1])  # stable: of equal rows the first stays first
-    first = np.ones(len(rows), dtype=bool)
-    first[1:] = np.any(rows[ascending[1:]] != rows[ascending[:-1]], axis=1)
-    return ascending[first]
+    known = np.isfinite(nearest) & np.isfinite(second)
+    ambiguous = known & (second <= 0)
+    with np.errstate(over="ignore"):
+        ratio = np.divide(nearest, second, out=np.full(len(nearest), np.nan), where=known & ~ambiguous)
+    return np.where(ambiguous, 1.0, np.clip(ratio, 0.0, 1.0)).astype(np.float32)
+
+
+def best_of_list(index2: NDArray[np.intp], distance: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+    """True (M,) where no other match reaches the same keypoint of image 2 at a smaller distance.
+
+    Returns None where the distances say nothing: some are missing, or several matches all have the same.
+    """
+    present = index2 >= 0
+    known = distance[present]
+    if not present.any() or not np.isfinite(known).all() or (len(known) > 1 and np.ptp(known) == 0):
+        return None
+    smallest = np.full(int(index2.max()) + 1, np.inf)
+    np.minimum.at(smallest, index2[present], known)
+    best = np.zeros(len(index2), dtype=bool)
+    best[present] = known <= smallest[index2[present]]
+    return best

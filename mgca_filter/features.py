@@ -1,13 +1,7 @@
-"""Keypoints in: ``cv2.KeyPoint`` sequences or arrays of pixels, to one plain structure.
-
-Pixels follow OpenCV throughout: the centre of the top-left pixel is (0, 0).
-"""
+"""Detect, describe and match: from two images to keypoints, descriptors and putative matches."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from operator import attrgetter
 from typing import Any
 
 import cv2
@@ -20,76 +14,6 @@ SIFT_FEATURE_COUNT = 2000
 SIFT_CONTRAST_THRESHOLD = 1e-5
 # In a narrower strip OpenCV's detectors find nothing, and some of them fail.
 _NARROWEST_PX = 6
-
-
-@dataclass(frozen=True)
-class Keypoints:
-    """Keypoints of one image.
-
-    Attributes:
-        points: (N, 2) float64 pixels; may hold NaN or infinite values, which later steps set aside.
-        size: (N,) float32 diameters in pixels, or None where the caller gave bare points.
-        angle: (N,) float32 orientations in degrees, −1 = unknown, or None.
-    """
-
-    points: NDArray[np.float64]
-    size: NDArray[np.float32] | None = None
-    angle: NDArray[np.float32] | None = None
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-def read_keypoints(keypoints: Any, name: str = "keypoints") -> Keypoints:
-    """Read a sequence of ``cv2.KeyPoint`` or an array (N, 2) or (N, 1, 2) of pixels.
-
-    Args:
-        keypoints: what the caller holds; an empty sequence gives no keypoints.
-        name: name of the argument, for messages.
-
-    Raises:
-        TypeError: neither KeyPoints nor numbers, or a mixture of both.
-        ValueError: an array of another shape.
-    """
-    if keypoints is None or isinstance(keypoints, (str, bytes, dict, cv2.KeyPoint)):
-        raise TypeError(
-            f"{name}: expected a sequence of cv2.KeyPoint or an array (N, 2), got {type(keypoints).__name__}"
-        )
-    if isinstance(keypoints, Sequence):
-        if any(isinstance(item, cv2.KeyPoint) for item in keypoints):
-            return _from_cv2(keypoints, name)
-        if len(keypoints) == 0:
-            return Keypoints(np.zeros((0, 2)))
-    return Keypoints(_read_points(keypoints, name))
-
-
-def _from_cv2(keypoints: Sequence[Any], name: str) -> Keypoints:
-    # Types first, each only once, then one field after the other: a quarter of the time of going object by object.
-    if not all(issubclass(kind, cv2.KeyPoint) for kind in set(map(type, keypoints))):
-        i, item = next((i, item) for i, item in enumerate(keypoints) if not isinstance(item, cv2.KeyPoint))
-        raise TypeError(f"{name}[{i}]: expected cv2.KeyPoint like its neighbours, got {type(item).__name__}")
-    points = np.asarray(cv2.KeyPoint.convert(tuple(keypoints)), dtype=np.float64)
-    size, angle = (
-        np.fromiter(map(attrgetter(field), keypoints), dtype=np.float32, count=len(keypoints))
-        for field in ("size", "angle")
-    )
-    return Keypoints(points, size, angle)
-
-
-def _read_points(points: Any, name: str) -> NDArray[np.float64]:
-    try:
-        array = np.asarray(points)
-    except (ValueError, TypeError) as error:  # rows of different length
-        raise ValueError(f"{name}: expected an array (N, 2) of pixels ({error})") from error
-    if array.dtype.kind not in "iuf":
-        raise TypeError(f"{name}: expected cv2.KeyPoint or real numbers, got dtype {array.dtype}")
-    if array.size == 0 and array.shape in ((0,), (0, 2), (0, 1, 2)):
-        return np.zeros((0, 2))
-    if array.ndim == 3 and array.shape[1:] == (1, 2):
-        array = array[:, 0]
-    if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name}: expected shape (N, 2) or (N, 1, 2), got {array.shape}")
-    return array.astype(np.float64)
 
 
 def create_detector(name: str = "sift", feature_count: int = SIFT_FEATURE_COUNT) -> cv2.Feature2D:
@@ -184,3 +108,28 @@ def _grey(image: Any, name: str) -> NDArray[np.uint8]:
     code = cv2.COLOR_BGR2GRAY if image.shape[2] == 3 else cv2.COLOR_BGRA2GRAY
     grey: NDArray[np.uint8] = cv2.cvtColor(image, code)  # type: ignore[assignment]
     return grey
+
+
+def match_descriptors(
+    descriptors1: NDArray[Any], descriptors2: NDArray[Any], norm: int | None = None
+) -> tuple[tuple[cv2.DMatch, ...], ...]:
+    """Two nearest neighbours in image 2 of every descriptor of image 1, as ``knnMatch`` returns them.
+
+    Args:
+        descriptors1, descriptors2: (N, D), of the same dtype. Without descriptors on either side there are no
+            matches.
+        norm: ``cv2.NORM_*``; None = Hamming distance for uint8, Euclidean distance for all others.
+
+    Raises:
+        ValueError: the two descriptor arrays differ in dtype or length D.
+    """
+    if len(descriptors1) == 0 or len(descriptors2) == 0:
+        return ()
+    if descriptors1.dtype != descriptors2.dtype or descriptors1.shape[1:] != descriptors2.shape[1:]:
+        raise ValueError(
+            f"descriptors2: expected {descriptors1.dtype} of length {descriptors1.shape[1:]} like descriptors1, "
+            f"got {descriptors2.dtype} of length {descriptors2.shape[1:]}"
+        )
+    if norm is None:
+        norm = cv2.NORM_HAMMING if descriptors1.dtype == np.uint8 else cv2.NORM_L2
+    return tuple(tuple(row) for row in cv2.BFMatcher(norm).knnMatch(descriptors1, descriptors2, k=2))

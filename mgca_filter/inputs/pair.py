@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .correspondences import MatchAttributes
-from .geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
+from ..geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
+from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
-from .matching import PutativeMatches, read_matches
+from .matches import PutativeMatches, read_matches
 
 # Normalised coordinates beyond this (89.9 degrees off the axis) come from broken input, not from a lens.
 _MAX_NORMALIZED = 1e3

@@ -1,0 +1,1 @@
+"""What the caller holds: keypoints, matches, attributes, options; read, checked and normalised."""
