@@ -22,10 +22,10 @@ import cv2
 import numpy as np
 
 from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
-from mgca_filter.backends import open_backend
-from mgca_filter.backends.onnx_backend import THREADS_VARIABLE
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
+from mgca_filter.inference import open_backend
+from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
 from mgca_filter.robust_fit import pose_from_essential
 from mgca_filter.scene_bundle import SceneBundle
 
@@ -51,7 +51,7 @@ MEMORY = """
 import re, sys
 import numpy as np
 import mgca_filter
-from mgca_filter.backends import open_backend
+from mgca_filter.inference import open_backend
 def peak_mib():
     return int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1]) / 1024
 before = peak_mib()

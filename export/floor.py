@@ -22,7 +22,7 @@ from onnx import TensorProto, helper, numpy_helper
 from parity import two_view_input
 
 import mgca_filter
-from mgca_filter.backends.base import OUTPUT_NAMES
+from mgca_filter.inference.backend import OUTPUT_NAMES
 
 # Parts by the names of their nodes, first match first; what ONNX Runtime fused carries its own name.
 PARTS = (

@@ -17,9 +17,9 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from .backends.base import INPUT_NAMES, OUTPUT_NAMES
-from .backends.metadata import CONTRACT_VERSION, METADATA_KEYS
-from .calibration import Calibration
+from .inference.backend import INPUT_NAMES, OUTPUT_NAMES
+from .inference.calibration import Calibration
+from .inference.metadata import CONTRACT_VERSION, METADATA_KEYS
 from .inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from .network import MGCANet, save_network
 from .network.config import ATTRIBUTE_CHANNELS

@@ -24,9 +24,9 @@ import pytest
 
 import mgca_filter
 from mgca_filter import FilterResult
-from mgca_filter.backends import OnnxBackend
 from mgca_filter.features import match_descriptors
 from mgca_filter.geometry.epipolar import pose_error_deg
+from mgca_filter.inference import OnnxBackend
 
 SOURCE = Path(__file__).parent.parent / "examples" / "cpp"
 FOUND, NOTHING_FOUND, ERROR = 0, 1, 2

@@ -15,9 +15,9 @@ from conftest import METADATA, SIZE, K, Scene, build_model, make_scene
 
 import mgca_filter
 from mgca_filter import FilterResult, MatchAttributes, MatchFilter, MatchPair, Status, filter_many, filter_matches
-from mgca_filter.calibration import largest_set_of_precision
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, sampson_distance
-from mgca_filter.scoring import MAX_NETWORK_MATCHES
+from mgca_filter.inference.calibration import largest_set_of_precision
+from mgca_filter.inference.scoring import MAX_NETWORK_MATCHES
 
 
 def run(scene: Scene, model_file: Path, **options: object) -> FilterResult:

@@ -9,7 +9,7 @@ import pytest
 from export_tools import parity
 
 import mgca_filter
-from mgca_filter.backends import Backend, open_backend
+from mgca_filter.inference import Backend, open_backend
 from mgca_filter.network import PRESETS, NetworkConfig
 
 MODELS = Path(mgca_filter.__file__).parent / "models"

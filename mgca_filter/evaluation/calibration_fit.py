@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ..calibration import Calibration, sigmoid
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
+from ..inference.calibration import Calibration, sigmoid
 from ..match_filter import MatchFilter
 from ..scene_bundle import ScenePair
 from .methods import BoolArray, FloatArray

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from ..backends.onnx_backend import THREADS_VARIABLE
+from ..inference.onnxruntime_ import THREADS_VARIABLE
 
 PACKAGES = (
     *("numpy", "opencv-contrib-python-headless", "opencv-contrib-python", "onnxruntime", "mgca-filter"),

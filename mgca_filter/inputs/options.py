@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..backends import Providers
+from ..types import Providers
 
 
 def check_choice(value: Any, choices: tuple[str, ...], name: str) -> None:

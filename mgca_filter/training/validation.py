@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ..calibration import sigmoid
 from ..evaluation.metrics import (
     FAILURE_DEG,
     TRUE_INLIER_DISTANCE_SQUARED,
@@ -20,6 +19,7 @@ from ..evaluation.metrics import (
 )
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
+from ..inference.calibration import sigmoid
 from ..inputs.attributes import candidate_mask
 from ..network import MGCANet
 from ..ranking import RankedMatches, match_order

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import BackendError, MgcaFilterError
-from .base import Backend
+from ..types import Providers
+from .backend import Backend
 from .metadata import CONTRACT_VERSION, METADATA_KEYS, ModelMetadata
-from .onnx_backend import OnnxBackend, Providers
-from .opencv_backend import OpenCvBackend
-from .torch_backend import TorchBackend
+from .onnxruntime_ import OnnxBackend
+from .opencv_ import OpenCvBackend
+from .torch_ import TorchBackend
 
 BACKENDS = ("auto", "onnxruntime", "opencv", "torch")
 _PROBE_MATCHES = 16
@@ -31,7 +32,6 @@ __all__ = [
     "ModelMetadata",
     "OnnxBackend",
     "OpenCvBackend",
-    "Providers",
     "TorchBackend",
     "open_backend",
     "shared_backend",

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .backends import Backend
-from .inputs.attributes import candidate_mask
+from ..inputs.attributes import candidate_mask
+from . import Backend
 
 MAX_NETWORK_MATCHES = 8000
 # Logit of a match without usable coordinates: low enough for a probability of zero under any calibration.

@@ -17,8 +17,8 @@ from test_backends import BackendContract, random_input
 
 import mgca_filter
 from mgca_filter import BackendError, ModelError, filter_matches
-from mgca_filter.backends import Backend, OpenCvBackend, open_backend, shared_backend
-from mgca_filter.backends.onnx_file import read_onnx_file
+from mgca_filter.inference import Backend, OpenCvBackend, open_backend, shared_backend
+from mgca_filter.inference.onnx_file import read_onnx_file
 
 opencv5 = pytest.mark.skipif(int(cv2.__version__.split(".")[0]) < 5, reason="the backend needs OpenCV 5")
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import BackendError, ModelError
-from .base import OUTPUT_NAMES, Float32Array, check_input, check_names
+from ..types import Providers
+from .backend import OUTPUT_NAMES, Float32Array, check_input, check_names
 from .metadata import ModelMetadata, check_model_file, parse_metadata
 from .onnx_file import read_onnx_file
 
@@ -61,7 +62,7 @@ class OnnxBackend:
         return self._metadata
 
     def infer(self, correspondences: Float32Array, attributes: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """One forward pass; see :class:`~mgca_filter.backends.base.Backend`."""
+        """One forward pass; see :class:`~mgca_filter.inference.backend.Backend`."""
         check_input(correspondences, attributes)
         try:
             logits, essential = self._session.run(

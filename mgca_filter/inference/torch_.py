@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import BackendError, ModelError
-from .base import Float32Array, check_input
+from .backend import Float32Array, check_input
 from .metadata import ModelMetadata, check_model_file, parse_metadata
 
 _HEADER_LENGTH_BYTES = 8
@@ -48,7 +48,7 @@ class TorchBackend:
         return self._metadata
 
     def infer(self, correspondences: Float32Array, attributes: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """One forward pass; see :class:`~mgca_filter.backends.base.Backend`."""
+        """One forward pass; see :class:`~mgca_filter.inference.backend.Backend`."""
         check_input(correspondences, attributes)
         torch = self._torch
         try:

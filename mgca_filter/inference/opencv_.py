@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..errors import BackendError
-from .base import INPUT_NAMES, OUTPUT_NAMES, Float32Array, check_input, check_names
+from .backend import INPUT_NAMES, OUTPUT_NAMES, Float32Array, check_input, check_names
 from .metadata import ModelMetadata, check_model_file, parse_metadata
 from .onnx_file import read_onnx_file
 
@@ -57,7 +57,7 @@ class OpenCvBackend:
         return self._metadata
 
     def infer(self, correspondences: Float32Array, attributes: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """One forward pass; see :class:`~mgca_filter.backends.base.Backend`."""
+        """One forward pass; see :class:`~mgca_filter.inference.backend.Backend`."""
         check_input(correspondences, attributes)
         try:
             with self._lock:

@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 from conftest import METADATA, build_model
 
-import mgca_filter.backends.torch_backend as torch_backend
-from mgca_filter import BackendError, ModelError, backends, filter_matches
-from mgca_filter.backends import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend, shared_backend
-from mgca_filter.backends.torch_backend import read_safetensors_metadata
-from mgca_filter.calibration import AttributePrior, Calibration, gelu
+import mgca_filter.inference.torch_ as torch_backend
+from mgca_filter import BackendError, ModelError, filter_matches
+from mgca_filter import inference as backends
+from mgca_filter.inference import METADATA_KEYS, Backend, OnnxBackend, TorchBackend, open_backend, shared_backend
+from mgca_filter.inference.calibration import AttributePrior, Calibration, gelu
+from mgca_filter.inference.torch_ import read_safetensors_metadata
 
 
 def random_input(count: int, batch: int = 2) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration import AttributePrior, Calibration
 from ..errors import ModelError
 from ..inputs.attributes import ATTRIBUTE_COUNT
+from .calibration import AttributePrior, Calibration
 from .checksums import check_checksum, sha256_of
 
 CONTRACT_VERSION = "1"
