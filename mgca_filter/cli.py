@@ -27,8 +27,8 @@ from .cli_arguments import (
 from .cli_output import MatchReport, picture, summary, to_json, write_npz
 from .comparison import BaselineFit, comparison_table, fit_baselines
 from .errors import MgcaFilterError
-from .estimators import METHODS
 from .features import DETECTORS
+from .fit.estimators import METHODS
 from .image_file import decode_image
 from .image_matching import match_images
 

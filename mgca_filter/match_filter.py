@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimators import METHODS
+from .fit.estimators import METHODS
+from .fit.ranking import RankedMatches, match_order
+from .fit.robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
+from .fit.verdict import Verdict, count_distinct, judge
 from .inference import BACKENDS, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_network_input
 from .inputs.attributes import MatchAttributes
 from .inputs.options import check_choice, check_integer, check_number, check_path, check_providers
 from .inputs.pair import MatchPair, PairInput, prepare_pair
-from .ranking import RankedMatches, match_order
 from .result import FilterResult, Status
-from .robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
 from .types import Providers
-from .verdict import Verdict, count_distinct, judge
 
 _BATCH_PAIRS = 8
 

@@ -1,4 +1,4 @@
-"""The robust fit of the C++ example is that of ``mgca_filter.robust_fit``: its starts, its choice, its refinement.
+"""The robust fit of the C++ example is that of ``mgca_filter.fit.robust_fit``: its starts, its choice, its refinement.
 
 What it needs: see ``cpp_program.py``.
 """
@@ -18,10 +18,10 @@ from conftest import METADATA, SIDEWAYS, SIZE, K, build_model
 from cpp_program import BUILD_TIMEOUT, SOURCE, Pair, assert_same_answer, build, build_program
 
 import mgca_filter
-from mgca_filter import robust_fit
+from mgca_filter.fit import robust_fit
+from mgca_filter.fit.ranking import RankedMatches, match_order
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
 from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector
-from mgca_filter.ranking import RankedMatches, match_order
 
 pytestmark = BUILD_TIMEOUT
 

@@ -9,13 +9,13 @@ import pytest
 from conftest import make_scene
 from scene_bundles import write_bundle
 
-from mgca_filter import robust_fit
 from mgca_filter.evaluation import never_worse
 from mgca_filter.evaluation.metrics import POSE_STATISTICS
 from mgca_filter.evaluation.paired_difference import paired_cells
 from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.start_study import StartOutcome, format_starts, study_starts
+from mgca_filter.fit import robust_fit
 
 
 @pytest.fixture

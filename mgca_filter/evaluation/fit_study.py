@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from ..errors import MgcaFilterError
+from ..fit.ranking import RankedMatches, match_order
+from ..fit.robust_fit import SINGLE_START, RobustFitOptions, Start, estimate_pose
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg
 from ..inputs.attributes import candidate_mask
 from ..match_filter import MatchFilter
-from ..ranking import RankedMatches, match_order
-from ..robust_fit import SINGLE_START, RobustFitOptions, Start, estimate_pose
 from ..scene_bundle import ScenePair
 from .metrics import FAILURE_DEG, POSE_STATISTICS, FloatArray, mean_over_scenes, paired_bootstrap_interval
 from .pairs import SceneSelection, iterate_pairs, select_pairs

@@ -33,7 +33,7 @@ VARIANTS = {
 NETWORK_ORDER = "network order"
 """Part of a row's name: the estimator behind it gets the plain matches, best logit first."""
 
-ANSWER_PACKAGES = ("geometry", "inference", "inputs", "network")
+ANSWER_PACKAGES = ("fit", "geometry", "inference", "inputs", "network")
 """Folders of the package whose code decides what the filter answers."""
 
 OTHER_PACKAGES = ("evaluation", "integrations", "training")

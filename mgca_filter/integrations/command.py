@@ -20,8 +20,8 @@ from ..cli_arguments import (
     positive,
 )
 from ..errors import MgcaFilterError
-from ..estimators import METHODS
 from ..features import DETECTORS
+from ..fit.estimators import METHODS
 from .pair_job import EngineOptions, Summary
 
 _EPILOG = """\

@@ -17,13 +17,13 @@ from ..evaluation.metrics import (
     mean_average_precision,
     precision_recall_f,
 )
+from ..fit.ranking import RankedMatches, match_order
+from ..fit.robust_fit import estimate_pose, pose_from_essential
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..inference.calibration import sigmoid
 from ..inputs.attributes import candidate_mask
 from ..network import MGCANet
-from ..ranking import RankedMatches, match_order
-from ..robust_fit import estimate_pose, pose_from_essential
 from ..scene_bundle import SceneBundle, ScenePair
 from .input_kinds import InputList, raw
 from .sources.bundles import is_held_out

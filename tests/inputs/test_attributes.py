@@ -6,9 +6,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mgca_filter.fit.ranking import distinct_rows
 from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.inputs.attributes import MatchAttributes, candidate_mask
-from mgca_filter.ranking import distinct_rows
 
 
 def test_unknown_groups_are_zero() -> None:

@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
-from .geometry.epipolar import (
+from ..geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
     pose_error_deg,
@@ -25,8 +24,9 @@ from .geometry.epipolar import (
     sampson_distance,
     triangulated_depths,
 )
-from .geometry.homography import poses_from_homography
-from .geometry.pose_refinement import refine_pose
+from ..geometry.homography import poses_from_homography
+from ..geometry.pose_refinement import refine_pose
+from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
 from .ranking import RankedMatches
 
 Array = NDArray[np.float64]

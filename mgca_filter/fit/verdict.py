@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.epipolar import fundamental_from_essential, sampson_distance
+from ..geometry.homography import homography_distance
+from ..inputs.pair import PairInput
+from ..result import Status
 from . import degeneracy
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, fit_homography
 from .focal_check import better_focal_factor
-from .geometry.epipolar import fundamental_from_essential, sampson_distance
-from .geometry.homography import homography_distance
-from .inputs.pair import PairInput
 from .ranking import RankedMatches, distinct_rows
-from .result import Status
 from .robust_fit import MIN_MATCHES, RobustFitOptions, TwoViewModel, estimate_model
 
 Array = NDArray[np.float64]

@@ -7,8 +7,8 @@ import pytest
 from conftest import SIZE, K, Scene, make_scene
 
 from mgca_filter import FilterResult, MatchFilter, Status
-from mgca_filter.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
-from mgca_filter.focal_check import FOCAL_STEP, better_focal_factor
+from mgca_filter.fit.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
+from mgca_filter.fit.focal_check import FOCAL_STEP, better_focal_factor
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg
 from mgca_filter.geometry.pose_refinement import refine_pose

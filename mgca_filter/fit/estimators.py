@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.epipolar import essential_from_pose, sampson_distance
+from ..geometry.epipolar import essential_from_pose, sampson_distance
 
 # A homography constrains both coordinates and planes are seldom perfect: it gets twice the threshold of E.
 HOMOGRAPHY_THRESHOLD_FACTOR = 2.0

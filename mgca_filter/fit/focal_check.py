@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.epipolar import cross_matrix, sampson_distance
-from .geometry.pose_refinement import MIN_INLIERS, refine_pose, rotation_from_vector, truncated_cost
+from ..geometry.epipolar import cross_matrix, sampson_distance
+from ..geometry.pose_refinement import MIN_INLIERS, refine_pose, rotation_from_vector, truncated_cost
 
 Array = NDArray[np.float64]
 

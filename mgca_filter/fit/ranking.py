@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.epipolar import essential_from_pose, sampson_distance, triangulated_depths
+from ..geometry.epipolar import essential_from_pose, sampson_distance, triangulated_depths
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from math import lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.epipolar import homogeneous, sampson_distance
-from .geometry.homography import homography_distance
+from ..geometry.epipolar import homogeneous, sampson_distance
+from ..geometry.homography import homography_distance
 from .ranking import distinct_rows
 
 Array = NDArray[np.float64]

@@ -1,0 +1,1 @@
+"""From scored matches to a judged two-view model."""
