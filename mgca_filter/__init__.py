@@ -10,8 +10,8 @@ from .image_matching import ImageMatchResult, match_images
 from .inputs.attributes import MatchAttributes
 from .inputs.pair import MatchPair
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
-from .opencv_api import findEssentialMat, findFundamentalMat, matchMGCA
-from .opencv_patch import patch_cv2
+from .opencv.patch import patch_cv2
+from .opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
 from .result import FilterResult, Status
 
 __version__ = "0.1.0"

@@ -2,7 +2,8 @@
 
 import sys
 
-from . import cli, opencv_script
+from . import cli
+from .opencv import script as opencv_script
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["run"]:

@@ -24,7 +24,7 @@ import numpy as np
 
 from .. import cli
 from ..match_filter import MatchFilter, model_path
-from ..opencv_api import findEssentialMat, findFundamentalMat, matchMGCA
+from ..opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
 from .hostile_files import FILES
 from .hostile_inputs import FORMS, HEIGHT, KINDS, WIDTH, K
 from .promises import broken_promises, broken_twin_answer

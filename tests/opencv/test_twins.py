@@ -17,7 +17,7 @@ from conftest import SIZE, K, Scene, make_scene
 import mgca_filter
 from mgca_filter import Status, filter_matches, findEssentialMat, findFundamentalMat, matchMGCA, patch_cv2
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
-from mgca_filter.opencv_api import _ESSENTIAL_OVERLOADS, _FUNDAMENTAL_OVERLOADS
+from mgca_filter.opencv.twins import _ESSENTIAL_OVERLOADS, _FUNDAMENTAL_OVERLOADS
 
 TWINS = {"E": lambda p1, p2: findEssentialMat(p1, p2, K), "F": findFundamentalMat}
 

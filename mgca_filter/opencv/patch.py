@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 
-from .opencv_api import findEssentialMat, findFundamentalMat, matchMGCA
+from .twins import findEssentialMat, findFundamentalMat, matchMGCA
 
 TWINS: dict[str, Callable[..., Any]] = {
     "findEssentialMat": findEssentialMat,
@@ -32,7 +32,7 @@ def patch_cv2() -> Iterator[None]:
     until the last one ends, by an exception or without. A name that other code has taken over by ``from cv2 import``
     before the swap stays OpenCV's. Where the cv2 at hand has no ``xfeatures2d``, there is nothing to swap.
 
-    What the twins make of their arguments, and what they cannot know, is told in :mod:`mgca_filter.opencv_api`.
+    What the twins make of their arguments, and what they cannot know, is told in :mod:`mgca_filter.opencv.twins`.
     """
     with swapped(TWINS):
         yield

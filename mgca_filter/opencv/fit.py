@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .geometry.cameras import mean_focal_length
-from .inputs.keypoints import read_keypoints
-from .inputs.options import check_integer, check_number
-from .inputs.pair import MatchPair
-from .match_filter import MatchFilter
-from .result import FilterResult
+from ..geometry.cameras import mean_focal_length
+from ..inputs.keypoints import read_keypoints
+from ..inputs.options import check_integer, check_number
+from ..inputs.pair import MatchPair
+from ..match_filter import MatchFilter
+from ..result import FilterResult
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.uint8]

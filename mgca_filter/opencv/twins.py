@@ -29,9 +29,9 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
-from .match_filter import filter_matches
-from .opencv_fit import Answer, fit_essential, fit_fundamental, read_fit, read_params, solve_fundamental
-from .opencv_overloads import call_overload
+from ..match_filter import filter_matches
+from .fit import Answer, fit_essential, fit_fundamental, read_fit, read_params, solve_fundamental
+from .overloads import call_overload
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 

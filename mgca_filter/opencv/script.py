@@ -19,9 +19,9 @@ from typing import Any
 import cv2
 import numpy as np
 
-from .errors import MgcaFilterError
-from .match_filter import MatchFilter
-from .opencv_patch import TWINS, locate, swapped
+from ..errors import MgcaFilterError
+from ..match_filter import MatchFilter
+from .patch import TWINS, locate, swapped
 
 EXIT_USAGE = 2
 

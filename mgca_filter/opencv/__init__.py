@@ -1,0 +1,1 @@
+"""OpenCV's own names, argument orders and return types over the filter."""
