@@ -6,10 +6,10 @@ Matplotlib; ONNX Runtime is loaded when the first model is opened.
 """
 
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
-from .image_matching import ImageMatchResult, match_images
 from .inputs.attributes import MatchAttributes
 from .inputs.pair import MatchPair
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
+from .match_images import ImageMatchResult, match_images
 from .opencv.patch import patch_cv2
 from .opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
 from .result import FilterResult, Status

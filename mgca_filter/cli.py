@@ -30,7 +30,7 @@ from .errors import MgcaFilterError
 from .features import DETECTORS
 from .fit.estimators import METHODS
 from .image_file import decode_image
-from .image_matching import match_images
+from .match_images import match_images
 
 SUBCOMMANDS = ("colmap", "hloc", "folder")
 _EPILOG = """\

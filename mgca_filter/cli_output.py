@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from . import __version__
 from .comparison import BaselineFit, describe_rotation, describe_translation
 from .drawing import Image, MatchPanel, draw_matches
-from .image_matching import ImageMatchResult
+from .match_images import ImageMatchResult
 from .result import FilterResult, Status
 
 _EXPLAINED = (Status.OK, Status.PLANAR, Status.PURE_ROTATION, Status.SUSPICIOUS_INTRINSICS)

@@ -24,7 +24,7 @@ from mgca_filter.evaluation.sources.colmap import covisible_pairs
 from mgca_filter.evaluation.sources.pair_lists import turn_camera
 from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
-from mgca_filter.image_matching import match_images
+from mgca_filter.match_images import match_images
 
 PROSAC = "mutual + ratio 0.9 + PROSAC 0.5 px"
 R_TRUE = rotation_from_vector(np.array([0.02, -0.08, 0.03]))
