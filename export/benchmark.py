@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 
 from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.fit.robust_fit import pose_from_essential
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
-from mgca_filter.scene_bundle import SceneBundle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "images"
 INLIER_DISTANCE = 1e-4  # squared symmetric epipolar distance on the normalised planes: the field's ground truth

@@ -19,10 +19,10 @@ import numpy as np
 
 import mgca_filter
 from mgca_filter import BackendError
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.inference import Backend, open_backend
 from mgca_filter.inference.scoring import select_network_input
 from mgca_filter.inputs.pair import MatchPair, prepare_pair
-from mgca_filter.scene_bundle import SceneBundle
 
 COUNTS = (1, 2, 7, 8, 9, 127, 512, 2000)
 MORE_COUNTS = (*COUNTS, 8000)

@@ -9,6 +9,7 @@ import pytest
 from conftest import make_scene
 from scene_bundles import write_bundle
 
+from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.evaluation.difficulty import (
     GROUPINGS,
     UNKNOWN,
@@ -24,7 +25,6 @@ from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.summary import summarize
 from mgca_filter.inputs.attributes import candidate_mask
-from mgca_filter.scene_bundle import SceneBundle, ScenePair
 
 
 @pytest.fixture

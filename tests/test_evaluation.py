@@ -15,6 +15,7 @@ from conftest import SIZE, K, Scene, make_scene
 from scene_bundles import write_bundle
 
 from mgca_filter import filter_matches
+from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.evaluation import predict as predict_module
 from mgca_filter.evaluation.__main__ import main
@@ -32,7 +33,6 @@ from mgca_filter.evaluation.store import ResultStore
 from mgca_filter.evaluation.summary import summarize
 from mgca_filter.evaluation.timing import Timing
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import ScenePair
 
 PROSAC = "mutual + ratio 0.9 + PROSAC 0.5 px"
 

@@ -14,13 +14,13 @@ from conftest import SIZE, K, Scene, make_scene
 from scene_bundles import write_bundle
 
 from mgca_filter import filter_matches
+from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.__main__ import main
 from mgca_filter.evaluation.predict import evaluate_pair
 from mgca_filter.evaluation.registry import GRID_ROWS, TIME_MATCHED_ROWS, parse_method
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.attributes import MatchAttributes
-from mgca_filter.scene_bundle import ScenePair
 
 ORDERED = "mutual + ratio 0.9 + network order + PROSAC 0.5 px"
 

@@ -14,6 +14,7 @@ import pytest
 from conftest import SIZE, K, Scene, make_scene
 from scene_bundles import write_bundle
 
+from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation import time_matching, timing
 from mgca_filter.evaluation.__main__ import main
 from mgca_filter.evaluation.environment import one_thread
@@ -22,7 +23,6 @@ from mgca_filter.evaluation.store import ResultStore
 from mgca_filter.evaluation.time_matching import match_times
 from mgca_filter.evaluation.timing import interleaved_ms, time_methods
 from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
-from mgca_filter.scene_bundle import ScenePair
 
 NO_STORE = ResultStore(None)
 

@@ -13,10 +13,10 @@ import cv2
 import numpy as np
 import pytest
 
+from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.features import create_detector, detect_keypoints, match_descriptors
 from mgca_filter.inputs.attributes import MatchAttributes, candidate_mask
 from mgca_filter.inputs.matches import read_matches
-from mgca_filter.scene_bundle import SceneBundle, ScenePair
 
 DATA = Path(os.environ.get("MGCA_FILTER_DATA", "absent"))
 PAIRS_PER_SCENE = 2

@@ -11,11 +11,11 @@ from conftest import SIZE, K, make_scene
 from scene_bundles import bundle_fields, write_bundle
 
 from mgca_filter import MatchFilter
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation import detectors, focal_error
 from mgca_filter.evaluation.image_sets import photographed, rendered
 from mgca_filter.geometry.epipolar import rotation_error_deg, symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import SceneBundle
 
 
 @pytest.fixture

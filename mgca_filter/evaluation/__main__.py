@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from ..data import FORMATS
 from ..errors import MgcaFilterError
 from .environment import library_versions, machine_description, one_thread, source_commit
 from .figures import draw_figures
@@ -21,7 +22,6 @@ from .predict import predict
 from .qualitative import draw_pairs
 from .registry import GRID_ROWS, PRODUCT_ROWS, RIVAL_ROWS, TIME_MATCHED_ROWS, parse_method
 from .report import format_report
-from .sources import FORMATS
 from .store import ResultStore
 from .summary import best_rival, choose_reference, summarize
 from .time_matching import TimeMatch, match_times

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 
 
 def adalam_versions() -> dict[str, str]:

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 from .estimators import Estimator
 from .methods import MIN_MATCHES, Answer
 from .selection import Selection

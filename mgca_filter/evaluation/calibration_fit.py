@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..data.scene_bundle import ScenePair
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
 from ..inference.calibration import Calibration, sigmoid
 from ..match_filter import MatchFilter
-from ..scene_bundle import ScenePair
 from .methods import BoolArray, FloatArray
 from .metrics import TRUE_INLIER_DISTANCE_SQUARED
 

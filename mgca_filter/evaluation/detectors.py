@@ -16,9 +16,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..data.scene_bundle import SceneBundle, ScenePair
 from ..errors import MgcaFilterError
 from ..features import create_detector
-from ..scene_bundle import SceneBundle, ScenePair
 from .image_sets import ImageSet, photographed, rendered
 from .metrics import POSE_STATISTICS, FloatArray
 from .paired_difference import paired_cells

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import ScenePair
 from ..geometry.epipolar import homogeneous
 from ..inputs.attributes import candidate_mask
-from ..scene_bundle import ScenePair
 from .metrics import POSE_STATISTICS, SceneErrors, pool_pairs
 
 STATISTICS = ("mAP@5", "mAP@20")

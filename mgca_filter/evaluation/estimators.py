@@ -12,9 +12,9 @@ from typing import Any, ClassVar, Protocol
 import cv2
 import numpy as np
 
+from ..data.scene_bundle import ScenePair
 from ..geometry.cameras import mean_focal_length, normalize_points
 from ..geometry.epipolar import project_to_essential
-from ..scene_bundle import ScenePair
 from .methods import MIN_MATCHES, BoolArray, FloatArray, PoseEstimate
 
 NEVER_CONFIDENT = 1.0 - 1e-9

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from ..data.scene_bundle import ScenePair
 from ..errors import MgcaFilterError
 from ..fit.ranking import RankedMatches, match_order
 from ..fit.robust_fit import SINGLE_START, RobustFitOptions, Start, estimate_pose
@@ -25,7 +26,6 @@ from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg
 from ..inputs.attributes import candidate_mask
 from ..match_filter import MatchFilter
-from ..scene_bundle import ScenePair
 from .metrics import FAILURE_DEG, POSE_STATISTICS, FloatArray, mean_over_scenes, paired_bootstrap_interval
 from .pairs import SceneSelection, iterate_pairs, select_pairs
 from .product import filter_pair

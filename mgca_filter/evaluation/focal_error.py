@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from ..errors import MgcaFilterError
 from ..geometry.epipolar import pose_error_deg, sampson_distance, symmetric_epipolar_distance_squared
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter, model_path
 from ..result import Status
-from ..scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED, mean_average_precision
 from .pairs import draw_indices
 

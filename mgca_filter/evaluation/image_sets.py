@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene_bundle import SceneBundle, ScenePair
+from ..data.image_features import View, describe, match_views
+from ..data.scene_bundle import SceneBundle, ScenePair
+from ..data.source import Image, check_folder, read_image
 from ..training.worlds.photographs import PhotoFolder
 from ..training.worlds.view_pairs import match_views as match_rendered
 from ..training.worlds.views import draw_views
-from .sources.base import Image, check_folder, read_image
-from .sources.image_features import View, describe, match_views
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 from .difficulty import PairProperties
 from .score_counts import ScoreCounts
 

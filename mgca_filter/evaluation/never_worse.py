@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from ..data.scene_bundle import ScenePair
 from ..errors import MgcaFilterError
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
-from ..scene_bundle import ScenePair
 from .methods import Answer, Method
 from .metrics import POSE_STATISTICS, TRUE_INLIER_DISTANCE_SQUARED, FloatArray, pool_pairs
 from .paired_difference import paired_cells

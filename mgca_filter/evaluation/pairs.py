@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..data import PairSource, open_sources
+from ..data.scene_bundle import ScenePair
 from ..errors import DatasetError
-from ..scene_bundle import ScenePair
-from .sources import PairSource, open_sources
 
 ALL_SCENES, ALL_PAIRS = "all", "pairs"
 """What rows of figures are called that are means over scenes and over pairs; no scene may have these names."""

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
+from ..data.image_features import FEATURE_SETTINGS, detect, match_features
+from ..data.source import digest_files
 from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
-from .sources.base import digest_files
-from .sources.image_features import FEATURE_SETTINGS, detect, match_features
 
 _SUFFIXES = (".jpg", ".jpeg", ".png")
 

@@ -11,9 +11,10 @@ from multiprocessing import get_context
 
 import numpy as np
 
+from ..data import PairSource
+from ..data.scene_bundle import ScenePair
 from ..errors import DatasetError
 from ..geometry.epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
-from ..scene_bundle import ScenePair
 from .difficulty import PairProperties
 from .environment import one_thread
 from .methods import UNREADABLE, Answer, Method, PairOutcome
@@ -21,7 +22,6 @@ from .metrics import FAILURE_DEG, PAPER_LOGIT, TRUE_INLIER_DISTANCE_SQUARED, pre
 from .pairs import SceneSelection
 from .progress import Progress
 from .score_counts import count_scores
-from .sources import PairSource
 from .store import ResultKey, ResultStore
 
 logger = logging.getLogger(__name__)

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import ScenePair
 from ..geometry.cameras import normalize_points
 from ..inputs.attributes import MatchAttributes
 from ..result import FilterResult
-from ..scene_bundle import ScenePair
 from .baselines import REVISION
 from .estimators import Estimator, estimate_from_essential
 from .methods import MIN_MATCHES, Answer, FloatArray, PoseEstimate
@@ -36,7 +36,7 @@ NETWORK_ORDER = "network order"
 ANSWER_PACKAGES = ("fit", "geometry", "inference", "inputs", "network")
 """Folders of the package whose code decides what the filter answers."""
 
-OTHER_PACKAGES = ("evaluation", "integrations", "opencv", "training")
+OTHER_PACKAGES = ("data", "evaluation", "integrations", "opencv", "training")
 """Folders of the package that only ask for answers; a test holds both lists against the tree."""
 
 BEST_SHARE = 0.1

@@ -8,15 +8,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..data.scene_bundle import ScenePair
+from ..data.source import Image
 from ..drawing import MatchPanel, draw_matches
 from ..errors import DatasetError
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
-from ..scene_bundle import ScenePair
 from .methods import Method
 from .metrics import FAILURE_DEG, TRUE_INLIER_DISTANCE_SQUARED
 from .pairs import SceneSelection
 from .predict import answer_pair
-from .sources.base import Image
 
 JPEG_QUALITY = 85
 SOLVED_DEG = 5.0

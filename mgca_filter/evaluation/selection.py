@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 from .adalam import adalam_versions, locally_affine_matches
 from .methods import BoolArray, FloatArray
 

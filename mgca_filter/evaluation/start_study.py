@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 
 import cv2
 
+from ..data.scene_bundle import ScenePair
 from ..geometry.epipolar import pose_error_deg
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
 from ..result import FilterResult
-from ..scene_bundle import ScenePair
 from .metrics import FAILURE_DEG, mean_average_precision
 
 NO_MODEL = "none"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 from .methods import Method
 from .registry import parse_method
 from .store import ResultStore

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..scene_bundle import ScenePair
+from ..data.scene_bundle import ScenePair
 from .environment import CpuMeter, one_thread, processor_name
 from .methods import Method
 from .metrics import FloatArray

@@ -20,12 +20,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import load_scene_bundles
 from ..errors import MgcaFilterError
 from ..geometry.epipolar import decompose_essential, pose_error_deg
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter, model_path
 from ..result import Status
-from ..scene_bundle import load_scene_bundles
 from .metrics import FAILURE_DEG
 from .pairs import draw_indices
 from .photo_pairs import PhotoFolder, draw_unrelated, read_places

@@ -16,10 +16,10 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
+from ..data import open_sources as open_pair_sources
+from ..data.scene_bundle import ScenePair
 from ..errors import MgcaFilterError
-from ..evaluation.sources import open_sources as open_pair_sources
 from ..network import MGCANet
-from ..scene_bundle import ScenePair
 from .config import ConfigError, TrainingConfig, load_config
 from .datasets import TrainingDataset
 from .loop import DivergedError, Trainer

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 
 from ..atomic_file import replaced_when_done
+from ..data.scene_bundle import ScenePair, load_scene_bundles
 from ..errors import MgcaFilterError
 from ..network.weights import count_parameters
-from ..scene_bundle import ScenePair, load_scene_bundles
 from .ablation_rows import ROWS, Row, row_phases
 from .config import ConfigError, TrainingConfig, load_config
 from .datasets import TrainingDataset

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from ..data.bundle_writer import BundleImage, BundlePair, write_bundle
+from ..data.colmap import ColmapSource, observed_points, open_reconstruction
+from ..data.image_features import View
 from ..errors import DatasetError
-from ..evaluation.sources.colmap import ColmapSource, observed_points, open_reconstruction
-from ..evaluation.sources.image_features import View
-from .bundle_writer import BundleImage, BundlePair, write_bundle
 from .sift import SiftFeatures, match_one_way
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import ScenePair
 from ..inputs.attributes import MatchAttributes
-from ..scene_bundle import ScenePair
 
 InputList = tuple[NDArray[np.intp], MatchAttributes]
 RATIO_TEST = 0.75

@@ -20,7 +20,7 @@ POSITIVE, NEGATIVE, IGNORED = 1, 0, -1
 
 
 class PosedPair(Protocol):
-    """Matches with a true pose, such as :class:`mgca_filter.scene_bundle.ScenePair`."""
+    """Matches with a true pose, such as :class:`mgca_filter.data.scene_bundle.ScenePair`."""
 
     @property
     def correspondences(self) -> NDArray[np.float64]: ...

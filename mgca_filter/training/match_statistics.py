@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene_bundle import ScenePair, load_scene_bundles
+from ..data.scene_bundle import ScenePair, load_scene_bundles
 from .labels import NEGATIVE, POSITIVE, clean_labels
 
 FloatArray = NDArray[np.float64]

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from ..data.scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from ..errors import BundleError, MgcaFilterError
 from ..network import MGCANet, load_network
-from ..scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from .input_kinds import INPUT_KINDS
 from .sampling import SamplingConfig
 from .validation import PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data.scene_bundle import SceneBundle, ScenePair
 from ..evaluation.metrics import (
     FAILURE_DEG,
     TRUE_INLIER_DISTANCE_SQUARED,
@@ -24,7 +25,6 @@ from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squa
 from ..inference.calibration import sigmoid
 from ..inputs.attributes import candidate_mask
 from ..network import MGCANet
-from ..scene_bundle import SceneBundle, ScenePair
 from .input_kinds import InputList, raw
 from .sources.bundles import is_held_out
 

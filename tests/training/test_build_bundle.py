@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from photographs import write_photographs
 
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.training.build_bundle import choose_pairs, main
 from mgca_filter.training.sources.bundles import BundleSource, check_pairs
 from mgca_filter.training.worlds.photographs import PhotoFolder

@@ -13,9 +13,9 @@ from conftest import make_scene
 from scene_bundles import bundle_fields, write_bundle
 from torch.utils.data import DataLoader
 
+from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.errors import BundleError
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.training.augmentation import AugmentationConfig
 from mgca_filter.training.datasets import TrainingDataset
 from mgca_filter.training.labels import POSITIVE, clean_labels

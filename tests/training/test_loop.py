@@ -20,9 +20,9 @@ from networks import TINY, tiny_network
 from scene_bundles import write_bundle
 from tiny_config import CONFIG_TOML
 
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.network import MGCANet, load_network, save_network
 from mgca_filter.network.weights import read_metadata
-from mgca_filter.scene_bundle import SceneBundle
 from mgca_filter.training import loop, run_directory, schedule
 from mgca_filter.training.__main__ import main
 from mgca_filter.training.config import ConfigError, ScheduleConfig, TrainingConfig, load_config

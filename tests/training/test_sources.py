@@ -12,10 +12,10 @@ from conftest import make_scene
 from photographs import write_photographs
 from scene_bundles import bundle_fields, write_bundle
 
+from mgca_filter.data.bundle_writer import LABEL_FIELD
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import SceneBundle
-from mgca_filter.training.bundle_writer import LABEL_FIELD
 from mgca_filter.training.config import ConfigError, SourceConfig, TrainingConfig
 from mgca_filter.training.labels import IGNORED, NEGATIVE, POSITIVE, clean_labels
 from mgca_filter.training.match_statistics import MatchStatistics, main, measure

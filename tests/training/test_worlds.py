@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from photographs import write_photographs
 
+from mgca_filter.data.bundle_writer import LABEL_FIELD
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
-from mgca_filter.scene_bundle import SceneBundle
-from mgca_filter.training.bundle_writer import LABEL_FIELD
 from mgca_filter.training.labels import NEGATIVE, POSITIVE
 from mgca_filter.training.render import main
 from mgca_filter.training.worlds.cameras import Camera

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.bundle_writer import LABEL_FIELD
+from ...data.scene_bundle import SceneBundle, ScenePair
 from ...errors import BundleError
-from ...scene_bundle import SceneBundle, ScenePair
-from ..bundle_writer import LABEL_FIELD
 from ..labels import epipolar_labels
 from ..pairs import TrainingPair
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ...data.oanet_hdf5 import OanetFile
 from ...errors import DatasetError
 from ...geometry.epipolar import essential_from_pose
-from ...oanet_hdf5 import OanetFile
 from ..labels import epipolar_labels
 from ..pairs import TrainingPair
 from .bundles import MINIMUM_MATCHES

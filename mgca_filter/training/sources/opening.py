@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...scene_bundle import SceneBundle, load_scene_bundles
+from ...data.scene_bundle import SceneBundle, load_scene_bundles
 from ..config import ConfigError, SourceConfig, TrainingConfig
 from .base import DataSource, MixedSource
 from .bundles import BundleSource, check_pairs

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ...data.bundle_writer import BundleImage, BundlePair
 from ...geometry.cameras import normalize_points
 from ...geometry.epipolar import essential_from_pose
-from ..bundle_writer import BundleImage, BundlePair
 from ..labels import POSITIVE
 from ..sift import OneWayMatches, match_one_way
 from .truth import match_labels, transfer_error, visible_share

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DatasetError
-from ...scene_bundle import ScenePair
+from ..errors import DatasetError
+from .scene_bundle import ScenePair
 
 ROTATION_TOLERANCE = 1e-3
 """Largest entry of R Rᵀ − I that passes for a rotation: text files carry few digits."""

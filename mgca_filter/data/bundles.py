@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from ...errors import BundleError
-from ...scene_bundle import SceneBundle, ScenePair
-from .base import Image, check_pose, digest_files, read_image
+from ..errors import BundleError
+from .scene_bundle import SceneBundle, ScenePair
+from .source import Image, check_pose, digest_files, read_image
 
 
 @dataclass(frozen=True)

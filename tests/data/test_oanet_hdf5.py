@@ -10,10 +10,10 @@ import pytest
 from conftest import K, Scene, make_scene
 from oanet_files import write_oanet
 
+from mgca_filter.data.oanet_hdf5 import GROUPS, OanetFile, best_by_mutual
 from mgca_filter.errors import DatasetError
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
-from mgca_filter.oanet_hdf5 import GROUPS, OanetFile, best_by_mutual
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ...errors import DatasetError
-from .base import PairSource
+from ..errors import DatasetError
 from .bundles import open_bundles
 from .colmap import open_reconstruction
 from .oanet import open_dumps
 from .pair_lists import open_pair_lists
+from .source import PairSource
 
 Opener = Callable[[Path, Path | None], Sequence[PairSource]]
 FORMATS: dict[str, Opener] = {

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DatasetError
-from ...scene_bundle import ScenePair
-from .base import Image, check_folder, check_intrinsics, check_pose, digest_files, find_files, read_image
+from ..errors import DatasetError
 from .image_features import FEATURE_SETTINGS, View, detect, match_views
+from .scene_bundle import ScenePair
+from .source import Image, check_folder, check_intrinsics, check_pose, digest_files, find_files, read_image
 
 VALUES_PER_LINE = 38
 """Two names, two rotation flags, K0 (9), K1 (9), T_0to1 (16)."""

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...oanet_hdf5 import OanetFile
-from ...scene_bundle import ScenePair
-from .base import Image, digest_files, find_files
+from .oanet_hdf5 import OanetFile
+from .scene_bundle import ScenePair
+from .source import Image, digest_files, find_files
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,9 @@ from conftest import SIZE, K, make_scene
 from oanet_files import write_oanet
 from scene_bundles import write_bundle
 
+from mgca_filter.data import open_sources
+from mgca_filter.data.colmap import covisible_pairs
+from mgca_filter.data.pair_lists import turn_camera
 from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation.baselines import Rival
 from mgca_filter.evaluation.estimators import OpenCvEstimator
@@ -19,9 +22,6 @@ from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.selection import Selection
-from mgca_filter.evaluation.sources import open_sources
-from mgca_filter.evaluation.sources.colmap import covisible_pairs
-from mgca_filter.evaluation.sources.pair_lists import turn_camera
 from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.match_images import match_images

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import DatasetError
-from ...scene_bundle import ScenePair
-from .base import Image, check_folder, check_pose, digest_files, read_image
+from ..errors import DatasetError
 from .image_features import FEATURE_SETTINGS, View, detect, match_views
+from .scene_bundle import ScenePair
+from .source import Image, check_folder, check_pose, digest_files, read_image
 
 MIN_COVISIBLE_POINTS = 15
 """Reconstructed points that two images must share to make a pair."""

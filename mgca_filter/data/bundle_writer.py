@@ -1,4 +1,4 @@
-"""Writing scene bundles: what :class:`mgca_filter.scene_bundle.SceneBundle` reads."""
+"""Writing scene bundles: what :class:`mgca_filter.data.scene_bundle.SceneBundle` reads."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
-from .sift import OneWayMatches
+from ..training.sift import OneWayMatches
 
 ANGLE_UNITS = 256  # of a full turn, to fit a byte
 LABEL_FIELD = "match_label"

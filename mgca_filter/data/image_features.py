@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ...features import create_detector, detect_keypoints, match_descriptors
-from ...inputs.attributes import MatchAttributes
-from ...inputs.matches import read_matches
-from ...scene_bundle import ScenePair
-from .base import Image, read_image
+from ..features import create_detector, detect_keypoints, match_descriptors
+from ..inputs.attributes import MatchAttributes
+from ..inputs.matches import read_matches
+from .scene_bundle import ScenePair
+from .source import Image, read_image
 
 FEATURE_SETTINGS = f"sift 2000, revision 1, opencv {cv2.__version__}"
 """Part of the digest of whatever is detected and matched here."""

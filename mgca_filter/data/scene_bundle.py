@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import BundleError
-from .geometry.cameras import normalize_points
-from .geometry.epipolar import essential_from_pose
-from .inputs.attributes import MatchAttributes
+from ..errors import BundleError
+from ..geometry.cameras import normalize_points
+from ..geometry.epipolar import essential_from_pose
+from ..inputs.attributes import MatchAttributes
 
 _FIELDS = (
     *("image_name", "image_size", "K", "R", "t"),

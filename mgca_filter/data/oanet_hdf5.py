@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import DatasetError
-from .inputs.attributes import MatchAttributes
+from ..errors import DatasetError
+from ..inputs.attributes import MatchAttributes
 
 GROUPS = ("xs", "ys", "Rs", "ts", "ratios", "mutuals", "cx1s", "cy1s", "cx2s", "cy2s", "f1s", "f2s")
 ROTATION_TOLERANCE = 1e-3

@@ -9,10 +9,10 @@ import pytest
 from conftest import Scene, make_scene
 from scene_bundles import bundle_fields, write_bundle
 
+from mgca_filter.data.scene_bundle import SceneBundle, load_scene_bundles
 from mgca_filter.errors import BundleError
 from mgca_filter.geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
-from mgca_filter.scene_bundle import SceneBundle, load_scene_bundles
 
 
 @pytest.fixture(scope="module")
