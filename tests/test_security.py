@@ -17,7 +17,7 @@ from mgca_filter.image_header import MAX_PIXELS, promised_size
 from mgca_filter.inference import metadata as backend_metadata
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.checksums import SUMS_NAME, check_checksum, read_checksums, record_checksums
-from mgca_filter.integrations.pair_worker import PairWorker
+from mgca_filter.pipelines.worker import PairWorker
 
 PACKAGE = Path(mgca_filter.__file__).parent
 # Calls that run what a file says: pickles in any wrapping, and code.

@@ -22,7 +22,7 @@ from ..cli_arguments import (
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
 from ..fit.estimators import METHODS
-from .pair_job import EngineOptions, Summary
+from ..pipelines.run import EngineOptions, Summary
 
 _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
@@ -121,7 +121,7 @@ def _check_output(options: argparse.Namespace, output: Path, inputs: Sequence[Pa
 
 
 def _run_colmap(options: argparse.Namespace) -> Summary:
-    from .colmap import ColmapJob
+    from ..pipelines.colmap import ColmapJob
 
     if options.in_place:
         output = options.database
@@ -133,14 +133,14 @@ def _run_colmap(options: argparse.Namespace) -> Summary:
     job = ColmapJob(options.database, output, use_descriptors=not options.no_descriptors)
     summary = _with_engine(job, options)
     if options.compare:
-        from .colmap_compare import compare, comparison_table
+        from ..pipelines.colmap_compare import compare, comparison_table
 
         print(comparison_table(compare(output, summary.seconds, options.truth, options.jobs)))
     return summary
 
 
 def _run_hloc(options: argparse.Namespace) -> Summary:
-    from .hloc import HlocJob
+    from ..pipelines.hloc import HlocJob
 
     _check_output(options, options.output, [options.features, options.matches])
     job = HlocJob(options.features, options.matches, options.output, use_descriptors=not options.no_descriptors)
@@ -148,8 +148,8 @@ def _run_hloc(options: argparse.Namespace) -> Summary:
 
 
 def _run_folder(options: argparse.Namespace) -> Summary:
-    from .folder import OUTPUTS, FolderJob
-    from .folder_pairs import exhaustive_pairs, list_images, read_pairs, sequential_pairs
+    from ..pipelines.folder import OUTPUTS, FolderJob
+    from ..pipelines.folder_pairs import exhaustive_pairs, list_images, read_pairs, sequential_pairs
 
     if options.output.suffix not in OUTPUTS:
         raise UsageError(f"{options.output}: expected a name that ends in {', '.join(OUTPUTS)}")

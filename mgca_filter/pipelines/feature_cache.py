@@ -13,8 +13,8 @@ import numpy as np
 
 from .engines import Engine
 from .journal import file_stamp, output_file
-from .pair_job import progress_bar
-from .pair_worker import ImageFeatures
+from .run import progress_bar
+from .worker import ImageFeatures
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from .colmap import HALF_PIXEL, write_geometries
 from .journal import PipelineError
-from .pair_worker import ImageFeatures, PairRow
+from .worker import ImageFeatures, PairRow
 
 # COLMAP's own guess for a camera of which nothing is known.
 _GUESSED_FOCAL_FACTOR = 1.2

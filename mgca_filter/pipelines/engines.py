@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import cv2
 
 from .journal import PipelineError
-from .pair_worker import PairWorker
+from .worker import PairWorker
 
 # Tasks that wait at each worker: enough that none idles while the driver reads the next, few enough for its memory.
 QUEUED_PER_WORKER = 2

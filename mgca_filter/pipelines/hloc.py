@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from .engines import Engine
 from .journal import Journal, PipelineError, file_stamp, output_file
-from .pair_job import Summary, run_identity, run_pairs, work_folder
-from .pair_worker import ImageFeatures, PairRow
+from .run import Summary, run_identity, run_pairs, work_folder
+from .worker import ImageFeatures, PairRow
 
 _SIFT_LENGTH = 128
 

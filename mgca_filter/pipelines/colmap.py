@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from .engines import Engine
 from .journal import Journal, PipelineError, output_file, sqlite_errors
-from .pair_job import Summary, run_identity, run_pairs, work_folder
-from .pair_worker import ImageFeatures, PairRow
+from .run import Summary, run_identity, run_pairs, work_folder
+from .worker import ImageFeatures, PairRow
 
 HALF_PIXEL = 0.5
 # Named in the sqlite3 module from Python 3.11 on.

@@ -9,10 +9,10 @@ import pytest
 from pipeline_command import K_WORDS
 
 from mgca_filter import cli
-from mgca_filter.integrations.pair_worker import ImageFeatures, PairWorker
+from mgca_filter.pipelines.worker import ImageFeatures, PairWorker
 
 ray = pytest.importorskip("ray")
-from mgca_filter.integrations.ray_engine import RayEngine  # noqa: E402
+from mgca_filter.pipelines.ray_engine import RayEngine  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
 

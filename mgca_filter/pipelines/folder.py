@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from .engines import Engine
 from .feature_cache import FeatureCache
 from .journal import Journal, output_file
-from .pair_job import Summary, run_identity, run_pairs, work_folder
-from .pair_worker import ImageFeatures, PairRow
+from .run import Summary, run_identity, run_pairs, work_folder
+from .worker import ImageFeatures, PairRow
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
 # Kinds of output, and the module that writing one needs.

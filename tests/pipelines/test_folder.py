@@ -18,8 +18,8 @@ from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.geometry.epipolar import pose_error_deg
-from mgca_filter.integrations.folder import FolderJob
-from mgca_filter.integrations.folder_pairs import exhaustive_pairs, sequential_pairs
+from mgca_filter.pipelines.folder import FolderJob
+from mgca_filter.pipelines.folder_pairs import exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
 
@@ -160,7 +160,7 @@ def test_a_file_of_the_subcommands_name_is_an_image(tmp_path, monkeypatch, capsy
 KILLED_AFTER_TWO_ROWS = """
 import os, signal, sys
 from mgca_filter import cli
-from mgca_filter.integrations.journal import Journal
+from mgca_filter.pipelines.journal import Journal
 add, rows = Journal.add, []
 def add_and_die(journal, row):
     add(journal, row)
@@ -186,7 +186,7 @@ def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected, caps
 
 
 def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
-    from mgca_filter.integrations.journal import Journal
+    from mgca_filter.pipelines.journal import Journal
 
     (tmp_path / "out.jsonl.work").mkdir()
     journal = Journal(tmp_path / "out.jsonl.work" / "journal.db")

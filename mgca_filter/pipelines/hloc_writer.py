@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from .pair_worker import FAILED, ImageFeatures, PairRow
+from .worker import FAILED, ImageFeatures, PairRow
 
 
 def write_features(path: Path, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> None:

@@ -14,9 +14,9 @@ from mgca_filter import cli
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
 pycolmap = pytest.importorskip("pycolmap")
-from mgca_filter.integrations import colmap  # noqa: E402
-from mgca_filter.integrations.colmap_compare import compare  # noqa: E402
-from mgca_filter.integrations.pair_worker import PairRow  # noqa: E402
+from mgca_filter.pipelines import colmap  # noqa: E402
+from mgca_filter.pipelines.colmap_compare import compare  # noqa: E402
+from mgca_filter.pipelines.worker import PairRow  # noqa: E402
 
 CONFIGURATION = pycolmap.TwoViewGeometryConfiguration
 # Distortion that bends the corners by several pixels, for models with one way to say it.

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
 from ..errors import MgcaFilterError
-from .pair_worker import PairRow
+from .worker import PairRow
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS job (description TEXT NOT NULL);

@@ -11,7 +11,7 @@ import cv2
 
 from .engines import QUEUED_PER_WORKER, use_one_thread
 from .journal import PipelineError
-from .pair_worker import PairWorker
+from .worker import PairWorker
 
 # A worker that dies (preempted machine, out of memory) is started again this often, and its tasks are repeated.
 RETRIES = 3

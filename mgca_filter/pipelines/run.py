@@ -17,7 +17,7 @@ from ..inference.checksums import sha256_of
 from ..match_filter import MatchFilter, model_path
 from .engines import Engine, ProcessEngine, SerialEngine, use_one_thread
 from .journal import Journal
-from .pair_worker import EXPLAINED, ImageFeatures
+from .worker import EXPLAINED, ImageFeatures
 
 # Images whose features the driver holds: 2000 SIFT keypoints take about a third of a megabyte.
 _CACHED_IMAGES = 1024
