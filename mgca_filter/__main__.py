@@ -1,11 +1,8 @@
-"""``python -m mgca_filter``: ``run script.py`` puts the filter into a script of OpenCV; else ``mgca-match``."""
+"""``python -m mgca_filter`` is ``mgca-match``."""
 
 import sys
 
-from . import cli
-from .opencv import script as opencv_script
+from .cli import main
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["run"]:
-        sys.exit(opencv_script.main(sys.argv[2:]))
-    sys.exit(cli.main())
+    sys.exit(main())

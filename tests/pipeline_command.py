@@ -14,7 +14,7 @@ K_WORDS = "512,512,319.5,239.5"
 def start_command(*arguments: object, **options) -> subprocess.Popen:
     """``mgca-match`` in a process of its own."""
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "mgca_filter.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "mgca_filter", *map(str, arguments)]
     return subprocess.Popen(
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **options
     )

@@ -13,8 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__
-from .cli_arguments import (
+from .. import __version__
+from ..errors import MgcaFilterError
+from ..features import DETECTORS
+from ..fit.estimators import METHODS
+from ..image_file import decode_image
+from ..match_images import match_images
+from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
     EXIT_USAGE,
@@ -24,15 +29,9 @@ from .cli_arguments import (
     one_line,
     positive,
 )
-from .cli_output import MatchReport, picture, summary, to_json, write_npz
-from .comparison import BaselineFit, comparison_table, fit_baselines
-from .errors import MgcaFilterError
-from .features import DETECTORS
-from .fit.estimators import METHODS
-from .image_file import decode_image
-from .match_images import match_images
+from .compare import BaselineFit, comparison_table, fit_baselines
+from .report import MatchReport, picture, summary, to_json, write_npz
 
-SUBCOMMANDS = ("colmap", "hloc", "folder")
 _EPILOG = """\
 For many images: mgca-match colmap | hloc | folder --help.
 
@@ -182,13 +181,8 @@ def _log_to_stderr(level: int) -> None:
     _log.setLevel(level)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
-    words = sys.argv[1:] if arguments is None else arguments
-    if words and words[0] in SUBCOMMANDS and not Path(words[0]).is_file():
-        from .integrations.command import main as run_subcommand
-
-        return run_subcommand(words)
+def main(arguments: Sequence[str]) -> int:
+    """Match two images; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
     try:
         options = build_parser().parse_args(arguments)
         _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)
@@ -198,7 +192,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"mgca-match: {one_line(error)}", file=sys.stderr)
         return EXIT_USAGE
     return EXIT_FOUND if report.found_geometry else EXIT_NO_GEOMETRY
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from ..cli_arguments import (
+from ..errors import MgcaFilterError
+from ..features import DETECTORS
+from ..fit.estimators import METHODS
+from ..pipelines.run import EngineOptions, Summary
+from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
     EXIT_USAGE,
@@ -19,10 +23,6 @@ from ..cli_arguments import (
     one_line,
     positive,
 )
-from ..errors import MgcaFilterError
-from ..features import DETECTORS
-from ..fit.estimators import METHODS
-from ..pipelines.run import EngineOptions, Summary
 
 _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or

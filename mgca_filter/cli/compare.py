@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .fit.ranking import RankedMatches
-from .fit.robust_fit import SINGLE_START, RobustFitOptions, estimate_model
-from .geometry.cameras import mean_focal_length, resolve_intrinsics
-from .geometry.epipolar import rotation_error_deg, sampson_distance
-from .result import FilterResult
+from ..fit.ranking import RankedMatches
+from ..fit.robust_fit import SINGLE_START, RobustFitOptions, estimate_model
+from ..geometry.cameras import mean_focal_length, resolve_intrinsics
+from ..geometry.epipolar import rotation_error_deg, sampson_distance
+from ..result import FilterResult
 
 BASELINES = {"RANSAC": "ransac", "MAGSAC": "magsac"}
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import SIZE, K, make_scene
 
-from mgca_filter.comparison import BASELINES, comparison_table, fit_baselines
+from mgca_filter.cli.compare import BASELINES, comparison_table, fit_baselines
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 from mgca_filter.result import FilterResult, Status

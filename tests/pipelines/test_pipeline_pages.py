@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parents[2]
 NEEDS = {"colmap": "pycolmap", "hloc": "h5py", "folder": "pycolmap", "ray": "ray"}
 # The package from here, under the names that users type.
 PREAMBLE = f"""set -euo pipefail
 python() {{ "{sys.executable}" "$@"; }}
-mgca-match() {{ "{sys.executable}" -m mgca_filter.cli "$@"; }}
+mgca-match() {{ "{sys.executable}" -m mgca_filter "$@"; }}
 """
 
 

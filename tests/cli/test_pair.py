@@ -16,7 +16,7 @@ import mgca_filter
 from mgca_filter import cli
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 IMAGES = ROOT / "examples" / "images"
 LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
 K_WORDS = "820,820,511.5,383.5"
@@ -28,7 +28,7 @@ JSON_KEYS = {
 
 def run_command(*arguments: str) -> subprocess.CompletedProcess:
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "mgca_filter.cli", *arguments]
+    command = [sys.executable, "-m", "mgca_filter", *arguments]
     return subprocess.run(command, capture_output=True, text=True, env=environment)
 
 
@@ -191,7 +191,7 @@ def test_every_option_reaches_the_filter(monkeypatch, words, expected):
         seen.update(options)
         raise ValueError("seen enough")
 
-    monkeypatch.setattr(cli, "match_images", record)
+    monkeypatch.setattr("mgca_filter.cli.pair.match_images", record)
     assert cli.main([LEFT, RIGHT, *words]) == 2
     for name, value in expected.items():
         np.testing.assert_array_equal(seen[name], value, err_msg=name)

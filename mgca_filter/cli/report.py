@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import __version__
-from .comparison import BaselineFit, describe_rotation, describe_translation
-from .drawing import Image, MatchPanel, draw_matches
-from .match_images import ImageMatchResult
-from .result import FilterResult, Status
+from .. import __version__
+from ..drawing import Image, MatchPanel, draw_matches
+from ..match_images import ImageMatchResult
+from ..result import FilterResult, Status
+from .compare import BaselineFit, describe_rotation, describe_translation
 
 _EXPLAINED = (Status.OK, Status.PLANAR, Status.PURE_ROTATION, Status.SUSPICIOUS_INTRINSICS)
 # Only these come with a pose that can be used as it is.
