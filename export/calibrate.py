@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
-from mgca_filter.evaluation.calibration_fit import collect_logits, expected_calibration_error, fit_calibration
 from mgca_filter.evaluation.methods import BoolArray, FloatArray
+from mgca_filter.export.calibration_fit import collect_logits, expected_calibration_error, fit_calibration
 from mgca_filter.inference.calibration import Calibration
 from mgca_filter.training.validation import select_pairs
 

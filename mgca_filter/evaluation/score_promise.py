@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from ..data.scene_bundle import ScenePair
 from ..errors import MgcaFilterError
+from ..export.calibration_fit import expected_calibration_error
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
 from ..inference.calibration import largest_set_of_precision
-from .calibration_fit import expected_calibration_error
 from .metrics import TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
 from .pairs import iterate_pairs, select_pairs
 from .product import filter_pair

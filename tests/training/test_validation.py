@@ -13,9 +13,9 @@ from scene_bundles import write_bundle
 from mgca_filter import MatchFilter, match_filter
 from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.evaluation.metrics import precision_recall_f
+from mgca_filter.export.onnx_export import ModelDescription, model_metadata
 from mgca_filter.inputs.attributes import candidate_mask
 from mgca_filter.network import save_network
-from mgca_filter.onnx_export import ModelDescription, model_metadata
 from mgca_filter.training import validation
 
 

@@ -12,8 +12,8 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import mgca_filter
-from mgca_filter.onnx_export import halve_weights
-from mgca_filter.onnx_simplify import simplify
+from mgca_filter.export.onnx_export import halve_weights
+from mgca_filter.export.onnx_simplify import simplify
 
 WIDTH = 4
 

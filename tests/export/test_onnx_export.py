@@ -14,10 +14,10 @@ from export_tools import parity
 from networks import tiny_network, two_view_batch
 from torch import nn
 
+from mgca_filter.export.onnx_export import ModelDescription, export_model, fold_batch_norm, model_metadata
 from mgca_filter.inference import METADATA_KEYS, Backend, open_backend
 from mgca_filter.inference.calibration import Calibration
 from mgca_filter.network import MGCANet, NetworkConfig, save_network
-from mgca_filter.onnx_export import ModelDescription, export_model, fold_batch_norm, model_metadata
 
 CONFIG = NetworkConfig(channels=16, clusters=8, stages=2)
 DESCRIPTION = ModelDescription(

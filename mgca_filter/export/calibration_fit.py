@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from ..data.scene_bundle import ScenePair
+from ..evaluation.methods import BoolArray, FloatArray
+from ..evaluation.metrics import TRUE_INLIER_DISTANCE_SQUARED
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
 from ..inference.calibration import Calibration, sigmoid
 from ..match_filter import MatchFilter
-from .methods import BoolArray, FloatArray
-from .metrics import TRUE_INLIER_DISTANCE_SQUARED
 
 _NEWTON_STEPS = 50
 _RIDGE = 1e-9

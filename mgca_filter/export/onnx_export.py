@@ -17,15 +17,15 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from .inference.backend import INPUT_NAMES, OUTPUT_NAMES
-from .inference.calibration import Calibration
-from .inference.metadata import CONTRACT_VERSION, METADATA_KEYS
-from .inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
-from .network import MGCANet, save_network
-from .network.config import ATTRIBUTE_CHANNELS
-from .network.graph import AnnularConvolution
-from .network.mgca_net import Prior
-from .network.point_cn import ChannelBatchNorm, LinearNorm, PointCN
+from ..inference.backend import INPUT_NAMES, OUTPUT_NAMES
+from ..inference.calibration import Calibration
+from ..inference.metadata import CONTRACT_VERSION, METADATA_KEYS
+from ..inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
+from ..network import MGCANet, save_network
+from ..network.config import ATTRIBUTE_CHANNELS
+from ..network.graph import AnnularConvolution
+from ..network.mgca_net import Prior
+from ..network.point_cn import ChannelBatchNorm, LinearNorm, PointCN
 from .onnx_simplify import simplify
 
 OPSET = 17
