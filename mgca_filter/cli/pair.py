@@ -17,7 +17,7 @@ from .. import __version__
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
 from ..fit.estimators import METHODS
-from ..image_file import decode_image
+from ..images import decode_image
 from ..match_images import match_images
 from .arguments import (
     EXIT_FOUND,

@@ -145,7 +145,7 @@ def filter_pair(
     pair: ScenePair, rows: NDArray[np.intp], model: str | None, options: dict[str, Any], *, bare: bool = False
 ) -> FilterResult:
     """What ``filter_matches`` says of the matches ``rows`` (N,); ``bare`` withholds their attributes."""
-    from mgca_filter import filter_matches
+    from ..match_filter import filter_matches
 
     attributes: MatchAttributes | None = None if bare else pair.attributes.take(rows)
     return filter_matches(
@@ -172,7 +172,7 @@ def model_settings(model: str | None, options: dict[str, Any]) -> dict[str, Any]
     """
     import onnxruntime
 
-    from mgca_filter import MatchFilter, model_path
+    from ..match_filter import MatchFilter, model_path
 
     MatchFilter(model=model, **options)
     path = Path(model_path() if model is None else model)

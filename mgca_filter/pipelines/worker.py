@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..features import create_detector, detect_keypoints, match_descriptors
-from ..image_file import decode_image
+from ..images import decode_image
 from ..inputs.attributes import MatchAttributes, best_of_list, distance_ratio
 from ..match_filter import MatchFilter
 from ..result import FilterResult, Status
