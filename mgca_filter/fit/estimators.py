@@ -24,7 +24,6 @@ _CONFIDENCE, _MAX_ITERATIONS = 0.999, 1000
 
 Array = NDArray[np.float64]
 
-METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
 # Behind the network hardly a sample is spoiled: PoseLib's own 1000 buy nothing but time.
 _POSELIB_MIN_ITERATIONS = 50
 # Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
