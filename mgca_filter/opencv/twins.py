@@ -15,9 +15,12 @@ What OpenCV's arguments mean here, for :func:`findEssentialMat` and :func:`findF
 - *UsacParams*: ``confidence``, ``threshold``, ``maxIterations`` and ``randomGeneratorState`` as above, ``score``
   chooses MAGSAC; the rest is not used.
 
-What comes back: a matrix (3, 3) float64, never several stacked, or None; and always a mask (N, 1) of 0 and 1, uint8.
-Data never raises. Where the images differ by a rotation alone there is no essential matrix: it is None, and the mask
-marks the matches that agree with the rotation. ``mgca_filter``'s log (level INFO) tells the status of every call.
+What comes back: a matrix (3, 3) float64, never several stacked, and always a mask (N, 1) of 0 and 1, uint8. A script
+that hands the matrix on, to ``cv2.recoverPose`` say, gets one wherever OpenCV would have given one: where the filter
+stands by none (a camera that only turns or stands still, unrelated images) it is the best that its robust fit found,
+else OpenCV's own, and the mask tells what is right about it: the matches that agree with the rotation, or none. It is
+None where OpenCV finds nothing either. Data never raises. ``mgca_filter``'s log (level INFO) tells the status of every
+call; :func:`mgca_filter.filter_matches` gives it as a value.
 """
 
 from __future__ import annotations
@@ -51,7 +54,7 @@ _FEWEST_PIXELS = 10.0
 # The filter's own thresholds are pixels; an image of this size stands in where the points are normalised.
 _USUAL_PIXELS = 1000.0
 # Bound at import, like those of the robust fit: the names in cv2 may be swapped.
-_find_fundamental_mat = cv2.findFundamentalMat
+_find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
 
 
 _log = logging.getLogger("mgca_filter")
@@ -77,8 +80,8 @@ def findEssentialMat(*args: Any, **kwargs: Any) -> Answer:
     Points are arrays (N, 2), (N, 1, 2) or (1, N, 2), pixels; see the module for the meaning of the other arguments.
 
     Returns:
-        E (3, 3) float64 of unit Frobenius norm, rank 2 and two equal singular values, ``x2^T E x1 = 0``, or None; and
-        the mask (N, 1) uint8.
+        E (3, 3) float64 of unit Frobenius norm, rank 2 and two equal singular values, ``x2^T E x1 = 0``, or None
+        where OpenCV finds none either; and the mask (N, 1) uint8.
 
     Raises:
         TypeError: the arguments fit no overload. ValueError: one has another shape or range.
@@ -255,7 +258,7 @@ def _read_params(params: cv2.UsacParams) -> FilterOptions:
 def _fit_essential(
     points1: Any, points2: Any, K1: Any, K2: Any, dist1: Any, dist2: Any, options: FilterOptions, mask: Any
 ) -> Answer:
-    """E (3, 3) or None, and the mask (N, 1); arguments as in :func:`mgca_filter.findEssentialMat`."""
+    """E (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findEssentialMat``."""
     points1, points2 = _read_points(points1, points2)
     K1, K2 = (np.asarray(K, dtype=np.float64) for K in (K1, K2))
     focal = mean_focal_length(K1, K2) if K1.shape == K2.shape == (3, 3) else 0.0
@@ -266,11 +269,14 @@ def _fit_essential(
         options = replace(options, threshold=options.threshold * zoom)
     pair = MatchPair(points1, points2, None, K1, K2, _coefficients(dist1), _coefficients(dist2))
     result = _run(pair, options, "findEssentialMat")
-    return result.E, _as_opencv_mask(result.mask, mask)
+    E = result.E if result.E is not None else result.info["fitted_essential"]
+    if E is None:
+        E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
+    return E, _as_opencv_mask(result.mask, mask)
 
 
 def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: Any) -> Answer:
-    """F (3, 3) or None, and the mask (N, 1); arguments as in :func:`mgca_filter.findFundamentalMat`."""
+    """F (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findFundamentalMat``."""
     points1, points2 = _read_points(points1, points2)
     extent = max(_extent(points1), _extent(points2))
     zoom = np.eye(3)
@@ -280,8 +286,20 @@ def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: A
         points1, points2 = (points * factor + _USUAL_PIXELS for points in (points1, points2))
         options = replace(options, threshold=options.threshold * factor)
     result = _run(MatchPair(points1, points2, None), options, "findFundamentalMat")
-    F = None if result.F is None else zoom.T @ result.F @ zoom
-    return _scaled(F), _as_opencv_mask(result.mask, mask)
+    F = result.F if result.F is not None else _find_by_opencv(_find_fundamental_mat, points1, points2)
+    return _scaled(None if F is None else zoom.T @ F @ zoom), _as_opencv_mask(result.mask, mask)
+
+
+def _find_by_opencv(function: Callable[..., Any], points1: Array, points2: Array, *arguments: Any) -> Array | None:
+    """The matrix (3, 3) of OpenCV's own function, the first where it stacks several; None where it finds none."""
+    usable = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
+    try:
+        M, _ = function(points1[usable], points2[usable], *arguments)
+    except cv2.error:
+        return None
+    if M is None or np.shape(M)[0] < 3 or not np.isfinite(M[:3]).all():
+        return None
+    return np.asarray(M[:3], dtype=np.float64)
 
 
 def _solve_fundamental(points1: Any, points2: Any, method: int, mask: Any) -> Answer:
