@@ -182,7 +182,7 @@ ALIGN = "lllrrrrl"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = done, 2 = a file or option that cannot be used."""
-    parser = study_parser("detectors", __doc__)
+    parser = study_parser("detectors", __doc__, per_scene=False)
     parser.add_argument(
         "--scene",
         nargs=2,

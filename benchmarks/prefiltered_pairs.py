@@ -1,4 +1,4 @@
-"""Never worse than the plain estimator? ``python -m benchmarks.prefiltered_pairs BUNDLES RENDERED.npz``.
+"""Never worse than the baseline? ``python -m benchmarks.prefiltered_pairs BUNDLES RENDERED.npz``.
 
 *Easy pairs*, of which 30 % of the raw matches and more are right: there a ratio test and PROSAC do well, and the filter
 must not spoil it. *Prefiltered pairs*: matches that passed a test that users apply, for the filter and the estimator
@@ -32,7 +32,7 @@ from .fit_ablation import compare_runs, run_table
 from .study import drawn_pairs, paired_cells, run_study, study_parser
 
 EASY_SHARE = 0.3
-PLAIN = "mutual + ratio 0.9 + PROSAC 0.5 px"
+BASELINE = "mutual + ratio 0.9 + PROSAC 0.5 px"
 TESTS = (
     Selection(max_ratio=0.75),
     Selection(max_ratio=0.8),
@@ -89,11 +89,11 @@ def pair_errors(outcomes: SceneOutcomes) -> FloatArray:
 def easy_table(groups: Mapping[str, Sequence[SceneSelection]], model: str | None, store: ResultStore) -> str:
     """The filter against PROSAC in ratio order, a line for each group of scenes."""
     body = []
-    methods = [parse_method("product", model), parse_method(PLAIN)]
+    methods = [parse_method("product", model), parse_method(BASELINE)]
     for name, selections in groups.items():
-        ours, plain = (pair_errors(outcomes) for outcomes in predict(methods, selections, store=store).values())
-        body.append([name, str(ours.shape[1]), *paired_cells(ours, plain, STATISTIC)])
-    return render_table(["pairs", "number", "filter mAP@5", f"{PLAIN} mAP@5", "difference"], body)
+        ours, theirs = (pair_errors(outcomes) for outcomes in predict(methods, selections, store=store).values())
+        body.append([name, str(ours.shape[1]), *paired_cells(ours, theirs, STATISTIC)])
+    return render_table(["pairs", "number", "filter mAP@5", f"{BASELINE} mAP@5", "difference"], body)
 
 
 def prefiltered_table(selections: Sequence[SceneSelection], model: str | None, store: ResultStore) -> str:

@@ -137,7 +137,7 @@ def full_calls(pair: RawPair) -> dict[str, Callable[[], Any]]:
     bare = (pair.points1, pair.points2, None)
     calls: dict[str, Callable[[], Any]] = {
         "filter_matches, ratio known": lambda: filters.filter(*pair.arguments, **known),
-        "filter_matches, bare points": lambda: filters.filter(*bare, K1=pair.K1, K2=pair.K2),
+        "filter_matches, points only": lambda: filters.filter(*bare, K1=pair.K1, K2=pair.K2),
     }
     for iterations in MAGSAC_ITERATIONS:
         calls[f"findEssentialMat(USAC_MAGSAC), {iterations} iterations"] = partial(magsac, pair, iterations)

@@ -16,11 +16,12 @@ from mgca_filter.inputs.pair import MatchPair
 from mgca_filter.result import FilterResult
 
 
-def study_parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    """Parser of ``python -m benchmarks.NAME`` with ``--per-scene``, ``--seed`` and ``--model``."""
+def study_parser(name: str, description: str | None, *, per_scene: bool = True) -> argparse.ArgumentParser:
+    """Parser of ``python -m benchmarks.NAME`` with ``--seed``, ``--model`` and, where it is wanted, ``--per-scene``."""
     parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}", description=description)
-    parser.add_argument("--per-scene", type=int, metavar="N", help="at most N pairs of a scene")
-    parser.add_argument("--seed", type=int, default=0, help="of the draw of pairs (default 0)")
+    if per_scene:
+        parser.add_argument("--per-scene", type=int, metavar="N", help="at most N pairs of a scene")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn: pairs, rendered worlds (default 0)")
     parser.add_argument("--model", metavar="FILE", help="of the filter (default: the one in the package)")
     return parser
 

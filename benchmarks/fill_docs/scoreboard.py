@@ -29,7 +29,7 @@ COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "media
 LABELS = {
     "product": "**mgca_filter**, default options",
     "product poselib": '**mgca_filter**, `method="poselib"`',
-    "product bare": "**mgca_filter**, bare points (no ratio, size, angle)",
+    "product bare": "**mgca_filter**, points only (no ratio, size, angle)",
     "network E": "network E, no RANSAC",
     "network RANSAC": "network + RANSAC 1e-3 (the papers' protocol)",
     "mutual + ratio 0.9 + network order + PROSAC 0.5 px": "mutual + ratio 0.9, sorted by our scores, PROSAC 0.5 px",

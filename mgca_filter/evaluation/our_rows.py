@@ -1,4 +1,4 @@
-"""The filter's own rows, run through the public door as users call it."""
+"""The filter's own rows, run through its public functions as users call them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ VARIANTS = {
     "product": "filter_matches, default options, with attributes, intrinsics and image sizes",
     "product poselib": "the same with method='poselib'",
     "product bare": "the same as product without attributes: positions only",
-    "network E": "recoverPose on the network's own E with the 10 % best-scored matches, no RANSAC",
+    "network E": "recoverPose on the network's essential matrix with the 10 % best-scored matches, no RANSAC",
     "network RANSAC": "findEssentialMat(RANSAC, 1e-3 normalised) on the matches of logit > 0, the papers' protocol",
 }
 """Names of the rows and what they run."""

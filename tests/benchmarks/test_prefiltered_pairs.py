@@ -11,8 +11,6 @@ from scene_bundles import write_bundle
 
 from benchmarks import prefiltered_pairs
 from benchmarks.fit_ablation import RunOutcome, compare_runs, run_table
-from benchmarks.study import paired_cells
-from mgca_filter.evaluation.metrics import POSE_STATISTICS
 from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.fit import robust_fit
@@ -57,17 +55,6 @@ def test_without_ratio_the_selection_has_it_and_the_filter_has_not(
     assert 50 < np.count_nonzero(answer.mask) <= np.count_nonzero(answer.kept)
     assert not (answer.mask & ~answer.kept).any()
     assert answer.R is not None
-
-
-def test_paired_cells_tell_figures_difference_and_interval() -> None:
-    good, bad = np.full((1, 20), 1.0), np.full((1, 20), 90.0)
-    statistic = POSE_STATISTICS["mAP@5"]
-    assert paired_cells(good, good, statistic) == ["100.0", "100.0", "+0.0 [+0.0, +0.0]"]
-    assert paired_cells(bad, good, statistic) == ["0.0", "100.0", "-100.0 [-100.0, -100.0]"]
-    half = np.where(np.arange(20) < 10, 1.0, 90.0)[None]
-    cells = paired_cells(half, bad, statistic)
-    assert cells[:2] == ["50.0", "0.0"]
-    assert cells[2].startswith("+50.0 [+")
 
 
 def test_first_run_alone_calls_the_estimator_once(
