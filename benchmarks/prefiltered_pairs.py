@@ -25,7 +25,7 @@ from mgca_filter.evaluation.predict import SceneOutcomes, predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.store import ResultStore
-from mgca_filter.evaluation.summary import scene_errors
+from mgca_filter.evaluation.summarize import scene_errors
 from mgca_filter.tables import render_table
 
 from .fit_ablation import compare_runs, run_table

@@ -20,7 +20,8 @@ from .predict import predict
 from .registry import BASELINE_ROWS, GRID_ROWS, PRODUCT_ROWS, TIME_MATCHED_ROWS, parse_method
 from .report import format_report
 from .store import ResultStore
-from .summary import Context, NotInstalled, Summary, best_baseline, choose_reference, summarize
+from .summarize import choose_reference, summarize
+from .summary import Context, NotInstalled, Summary, best_baseline
 from .timing import TimeMatch, match_times, time_methods
 
 logger = logging.getLogger(__name__)

@@ -54,7 +54,7 @@ def draw_figures(summary: Summary, folder: str | Path, prefix: str = "") -> list
     """Write every picture that the summary has the figures for, as SVG; returns the files.
 
     Args:
-        summary: what :func:`summary.summarize` returned, or what was read from its file.
+        summary: what :func:`summarize.summarize` returned, or what was read from its file.
         folder: made where it is not there.
         prefix: of the file names ``recall``, ``precision_recall``, ``reliability``, ``time_accuracy``.
 

@@ -23,7 +23,7 @@ from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.report import format_report
-from mgca_filter.evaluation.summary import summarize
+from mgca_filter.evaluation.summarize import summarize
 from mgca_filter.inputs.attributes import candidate_mask
 
 

@@ -30,7 +30,8 @@ from mgca_filter.evaluation.registry import BASELINE_ROWS, PRODUCT_ROWS, parse_m
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.store import ResultStore
-from mgca_filter.evaluation.summary import Context, Summary, summarize
+from mgca_filter.evaluation.summarize import summarize
+from mgca_filter.evaluation.summary import Context, Summary
 from mgca_filter.evaluation.timing import Timing
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
 

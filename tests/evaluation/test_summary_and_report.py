@@ -24,6 +24,7 @@ from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import BASELINE_ROWS, PRODUCT_ROWS, parse_method
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.store import ResultKey, ResultStore
+from mgca_filter.evaluation.summarize import precision_recall_curves, recall_curves, reliability_tables, summarize
 from mgca_filter.evaluation.summary import (
     Context,
     NotInstalled,
@@ -31,10 +32,6 @@ from mgca_filter.evaluation.summary import (
     UnreadablePair,
     best_baseline,
     is_ours,
-    precision_recall_curves,
-    recall_curves,
-    reliability_tables,
-    summarize,
 )
 from mgca_filter.evaluation.timing import TimeMatch, Timing
 
