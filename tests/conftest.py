@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from mgca_filter import MatchFilter
 from mgca_filter.geometry.epipolar import essential_from_pose
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.inputs.attributes import MatchAttributes
+
+# Benchmarks are no part of the package: they come from the checkout, behind whatever package is installed.
+sys.path.append(str(Path(__file__).parent.parent))
 
 K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)

@@ -54,7 +54,7 @@ def test_wheel_holds_the_model_its_card_and_the_type_marker(wheel):
     assert any(name.startswith("mgca_filter/models/") and name.endswith(".onnx") for name in names)
     assert any(name.startswith("mgca_filter/models/") and name.endswith(".md") for name in names)
     assert any(name.endswith("LICENSE") for name in names)
-    assert not any(name.startswith(("tests/", "examples/", "export/")) for name in names)
+    assert not any(name.startswith(("tests/", "examples/", "export/", "benchmarks/")) for name in names)
 
 
 def test_wheel_alone_runs_the_command_outside_the_source_tree(wheel, tmp_path):

@@ -11,8 +11,8 @@ import pytest
 from conftest import METADATA, build_model
 
 import mgca_filter
+from benchmarks.bad_input.files import png_that_promises
 from mgca_filter import ModelError, cli, model_path
-from mgca_filter.evaluation.hostile_files import png_that_promises
 from mgca_filter.image_header import MAX_PIXELS, promised_size
 from mgca_filter.inference import metadata as backend_metadata
 from mgca_filter.inference import open_backend

@@ -8,24 +8,21 @@ import logging
 import math
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from ..data import FORMATS
 from ..errors import MgcaFilterError
 from .environment import library_versions, machine_description, one_thread, source_commit
-from .figures import draw_figures
+from .figures import draw_figures, draw_pairs
 from .methods import Method
 from .pairs import SceneSelection, sample_pairs, select_pairs
 from .predict import predict
-from .qualitative import draw_pairs
-from .registry import GRID_ROWS, PRODUCT_ROWS, RIVAL_ROWS, TIME_MATCHED_ROWS, parse_method
+from .registry import BASELINE_ROWS, GRID_ROWS, PRODUCT_ROWS, TIME_MATCHED_ROWS, parse_method
 from .report import format_report
 from .store import ResultStore
-from .summary import best_rival, choose_reference, summarize
-from .time_matching import TimeMatch, match_times
-from .timing import time_methods
+from .summarize import choose_reference, summarize
+from .summary import Context, NotInstalled, Summary, best_baseline
+from .timing import TimeMatch, match_times, time_methods
 
 logger = logging.getLogger(__name__)
 
@@ -37,8 +34,8 @@ def build_parser() -> argparse.ArgumentParser:
     """Arguments of the command."""
     parser = argparse.ArgumentParser(
         prog="python -m mgca_filter.evaluation",
-        description="Relative pose from putative matches: the filter and its rivals on the same pairs.",
-        epilog=f"Methods by default: {'; '.join([*RIVAL_ROWS, *PRODUCT_ROWS])}.",
+        description="Relative pose from putative matches: the filter and its baselines on the same pairs.",
+        epilog=f"Methods by default: {'; '.join([*BASELINE_ROWS, *PRODUCT_ROWS])}.",
     )
     parser.add_argument("path", nargs="+", metavar="PATH", help="files, folders of files, or COLMAP reconstructions")
     parser.add_argument(
@@ -55,7 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
         "--methods",
         nargs="+",
         metavar="NAME",
-        help="rows such as 'mutual + ratio 0.9 + PROSAC 0.5 px' or 'product'; 'rivals' and 'product-rows' stand for "
+        help="rows such as 'mutual + ratio 0.9 + PROSAC 0.5 px' or 'product'; 'baselines' and 'product-rows' stand for "
         "the default rows of either kind, 'grid' for every test of the matches before every estimator",
     )
     parser.add_argument(
@@ -90,8 +87,8 @@ def build_parser() -> argparse.ArgumentParser:
         type=_positive,
         default=2,
         metavar="N",
-        help="pairs of each scene among the figures (default 2): reference and best rival, right matches green, wrong "
-        "ones red",
+        help="pairs of each scene among the figures (default 2): reference and best baseline, right matches green, "
+        "wrong ones red",
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress on standard error")
     return parser
@@ -111,8 +108,8 @@ def _positive(text: str) -> int:
 
 
 def _expand(names: Sequence[str] | None) -> list[str]:
-    groups = {"rivals": RIVAL_ROWS, "product-rows": PRODUCT_ROWS, "grid": GRID_ROWS}
-    chosen = [row for name in names or ("rivals", "product-rows") for row in groups.get(name, (name,))]
+    groups = {"baselines": BASELINE_ROWS, "product-rows": PRODUCT_ROWS, "grid": GRID_ROWS}
+    chosen = [row for name in names or ("baselines", "product-rows") for row in groups.get(name, (name,))]
     return list(dict.fromkeys(chosen))
 
 
@@ -146,9 +143,9 @@ def run(options: argparse.Namespace) -> None:
     methods, not_installed = _installed([parse_method(name, options.model) for name in _expand(options.methods)])
     time_matched: list[TimeMatch] = []
     if options.time_matched is not None:
-        rivals, lacking = _installed([parse_method(name) for name in TIME_MATCHED_ROWS])
+        baselines, lacking = _installed([parse_method(name) for name in TIME_MATCHED_ROWS])
         like = parse_method(options.time_matched, options.model)
-        names = [rival.name for rival in rivals]
+        names = [baseline.name for baseline in baselines]
         sample = sample_pairs(selections, math.ceil(MATCHING_PAIRS / len(selections)))
         time_matched = match_times(names, like, sample, store)
         methods += [parse_method(match.method) for match in time_matched]
@@ -158,14 +155,13 @@ def run(options: argparse.Namespace) -> None:
         methods, selections, seeds=options.seeds, workers=options.workers, store=store, progress=not options.quiet
     )
     timing = time_methods(methods, sample_pairs(selections, options.times), store) if options.times else None
-    context = {**_context(options, selections, methods), "not_installed": not_installed}
-    context["time_matched"] = [asdict(match) for match in time_matched]
+    context = _context(options, selections, methods, not_installed, time_matched)
     settings = {"reference": reference, "replicates": options.bootstrap, "seed": options.seed}
     summary = summarize(results, context, timing, **settings)
     _write(options, summary)
     if options.figures:
         draw_figures(summary, options.figures)
-        shown = dict.fromkeys([best_rival(summary, reference), reference])
+        shown = dict.fromkeys([best_baseline(summary.rows, reference), reference])
         pictured = [method for name in shown for method in methods if method.name == name]
         draw_pairs(pictured, selections, options.figures, options.pictures)
 
@@ -178,7 +174,7 @@ def _check_outputs(options: argparse.Namespace) -> None:
             raise ValueError(f"--{name}: {path}: its folder is not there")
 
 
-def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[dict[str, str]]]:
+def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[NotInstalled]]:
     """The methods that can run, and the others with the reason.
 
     Raises:
@@ -189,42 +185,49 @@ def _installed(methods: Sequence[Method]) -> tuple[list[Method], list[dict[str, 
         try:
             method.settings()
         except ImportError as error:
-            lacking.append({"method": method.name, "reason": str(error)})
+            lacking.append(NotInstalled(method.name, str(error)))
         else:
             usable.append(method)
     if not usable:
-        raise ImportError("; ".join(f"{item['method']}: {item['reason']}" for item in lacking))
+        raise ImportError("; ".join(f"{item.method}: {item.reason}" for item in lacking))
     return usable, lacking
 
 
 def _context(
-    options: argparse.Namespace, selections: Sequence[SceneSelection], methods: Sequence[Method]
-) -> dict[str, Any]:
+    options: argparse.Namespace,
+    selections: Sequence[SceneSelection],
+    methods: Sequence[Method],
+    not_installed: Sequence[NotInstalled],
+    time_matched: Sequence[TimeMatch],
+) -> Context:
     """What the figures depend on besides the methods' answers."""
-    return {
-        "seed": options.seed,
-        "versions": library_versions(),
-        "commit": source_commit(),
-        "machine": machine_description(),
-        "settings": {
-            "format": options.format,
-            "per_scene": options.per_scene,
-            "seeds": options.seeds,
-            "workers": options.workers,
-            "data_sha256": {selection.scene: selection.sha256 for selection in selections},
-            "methods": {method.name: method.settings() for method in methods},
-        },
+    settings = {
+        "format": options.format,
+        "per_scene": options.per_scene,
+        "seeds": options.seeds,
+        "workers": options.workers,
+        "data_sha256": {selection.scene: selection.sha256 for selection in selections},
+        "methods": {method.name: method.settings() for method in methods},
     }
+    return Context(
+        seed=options.seed,
+        versions=library_versions(),
+        commit=source_commit(),
+        machine=machine_description(),
+        settings=settings,
+        not_installed=tuple(not_installed),
+        time_matched=tuple(time_matched),
+    )
 
 
-def _write(options: argparse.Namespace, summary: dict[str, Any]) -> None:
+def _write(options: argparse.Namespace, summary: Summary) -> None:
     if options.json == "-":
-        json.dump(summary, sys.stdout, indent=1)
+        json.dump(summary.to_json(), sys.stdout, indent=1)
         print()
     else:
         print(format_report(summary, "text"))
     if options.json not in (None, "-"):
-        Path(options.json).write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+        Path(options.json).write_text(json.dumps(summary.to_json(), indent=1) + "\n", encoding="utf-8")
     if options.markdown:
         Path(options.markdown).write_text(format_report(summary, "markdown"), encoding="utf-8")
     if options.latex:

@@ -87,9 +87,31 @@ def ray_angles_deg(correspondences: NDArray[np.float64], R: NDArray[np.float64])
     return np.asarray(np.degrees(np.arctan2(across, np.sum(rays1 * rays2, axis=1))), dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class DifficultyGroup:
+    """Figures on the pairs of one group: by method those of :data:`STATISTICS`, per cent, mean over pairs."""
+
+    group: str
+    pairs: int
+    methods: dict[str, dict[str, float]]
+
+
+@dataclass(frozen=True)
+class DifficultyTable:
+    """The groups of one property of the pairs, from the lowest values on."""
+
+    property: str
+    groups: list[DifficultyGroup]
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> DifficultyTable:
+        """Table from what ``dataclasses.asdict`` gave."""
+        return cls(content["property"], [DifficultyGroup(**group) for group in content["groups"]])
+
+
 def figures_by_difficulty(
     errors: Mapping[str, SceneErrors], properties: Sequence[PairProperties | None]
-) -> list[dict[str, Any]]:
+) -> list[DifficultyTable]:
     """For each property its groups, and of every method the figures on each group, per cent, mean over pairs.
 
     Args:
@@ -97,8 +119,7 @@ def figures_by_difficulty(
         properties: of the scenes' pairs one after the other; None where a pair could not be read.
 
     Returns:
-        One entry a property: ``property``, ``groups`` (``group``, ``pairs``, and ``methods`` with their figures);
-        groups without a pair are left out.
+        One table a property; groups without a pair are left out.
     """
     pooled = {name: pool_pairs(scenes) for name, scenes in errors.items()}
     tables = []
@@ -112,6 +133,6 @@ def figures_by_difficulty(
                     method: {key: 100.0 * float(POSE_STATISTICS[key](values[:, chosen])) for key in STATISTICS}
                     for method, values in pooled.items()
                 }
-                groups.append({"group": name, "pairs": int(np.count_nonzero(chosen)), "methods": methods})
-        tables.append({"property": grouping.title, "groups": groups})
+                groups.append(DifficultyGroup(name, int(np.count_nonzero(chosen)), methods))
+        tables.append(DifficultyTable(grouping.title, groups))
     return tables

@@ -75,7 +75,7 @@ def _git(folder: Path, *arguments: str) -> str:
 def one_thread() -> Iterator[None]:
     """OpenCV, and sessions of ONNX Runtime that are opened within the block, keep to one thread.
 
-    The number of threads changes no figure but the times, in which rivals have one thread too.
+    The number of threads changes no figure but the times, in which baselines have one thread too.
     """
     opencv_threads, onnx_threads = cv2.getNumThreads(), os.environ.get(THREADS_VARIABLE)
     cv2.setNumThreads(1)

@@ -6,14 +6,12 @@ from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..data.scene_bundle import ScenePair
 from .difficulty import PairProperties
-from .score_counts import ScoreCounts
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
+from .metrics import BoolArray as BoolArray
+from .metrics import FloatArray as FloatArray
+from .metrics import ScoreCounts
 
 MIN_MATCHES = 5
 
@@ -42,7 +40,7 @@ class Answer:
 
     Attributes:
         R, t: (3, 3) and (3,), ``X2 = R X1 + t``, or None where the method has no pose.
-        kept: bool (M,), the decision before the robust fit: a rival's selection, the network's logit > 0.
+        kept: bool (M,), the decision before the robust fit: a baseline's selection, the network's logit > 0.
         mask: bool (M,), the decision after it: what a user gets.
         failure: empty, or why there is no pose.
         logits, scores: (M,) the network's logits and the probabilities made from them, for methods that have any.

@@ -1,4 +1,4 @@
-"""Figures of the field's relative-pose protocol, in plain numpy.
+"""Figures of the field's relative-pose protocol, and of the scores of matches, in plain numpy.
 
 Pose errors are degrees; a pair without a pose has :data:`FAILURE_DEG`. Errors of a method on one scene come as
 (S, P): S runs of a randomised estimator with different seeds over P pairs. Every figure is computed per run and
@@ -8,13 +8,17 @@ in per cent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.epipolar import symmetric_epipolar_distance_squared
+
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 Figures = Any  # a float for errors (P,) or (S, P), an array (…) of them for errors (…, S, P)
 Statistic = Callable[[FloatArray], Figures]
 SceneErrors = Mapping[str, FloatArray]
@@ -28,6 +32,12 @@ _REPLICATES_AT_ONCE = 50
 
 TRUE_INLIER_DISTANCE_SQUARED = 1e-4
 """Squared symmetric epipolar distance on the normalised planes below which a match counts as a true inlier."""
+
+
+def true_matches(correspondences: FloatArray, E: FloatArray) -> BoolArray:
+    """Bool (M,), True for matches (M, 4) on the normalised planes that lie near the true epipolar lines of E (3, 3)."""
+    distance = symmetric_epipolar_distance_squared(correspondences, E)
+    return np.asarray(distance < TRUE_INLIER_DISTANCE_SQUARED)
 
 
 def precision_recall_f(kept: ArrayLike, truth: ArrayLike) -> tuple[float, float, float]:
@@ -132,18 +142,6 @@ def mean_over_pairs(statistic: Statistic, errors: SceneErrors) -> float:
     return float(statistic(pool_pairs(errors)))
 
 
-def bootstrap_interval(
-    errors: SceneErrors, statistic: Statistic, *, replicates: int = 1000, level: float = 0.95, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean over scenes.
-
-    Pairs are drawn with replacement within their scene: the interval speaks of the chance in the choice of pairs, the
-    scenes being what they are. All runs (seeds) of a drawn pair come along.
-    """
-    resampled = resampled_figures(errors, statistic, replicates=replicates, seed=seed)
-    return percentile_interval(resampled.mean(axis=0), level)
-
-
 def paired_bootstrap_interval(
     errors: SceneErrors,
     baseline: SceneErrors,
@@ -155,7 +153,9 @@ def paired_bootstrap_interval(
 ) -> tuple[float, float]:
     """Percentile bootstrap interval of the difference ``errors`` − ``baseline`` of the means over scenes.
 
-    Both methods are seen on the same drawn pairs each time, so that what makes a pair hard for both cancels out.
+    Pairs are drawn with replacement within their scene: the interval speaks of the chance in the choice of pairs, the
+    scenes being what they are. All runs (seeds) of a drawn pair come along. Both methods are seen on the same drawn
+    pairs each time, so that what makes a pair hard for both cancels out.
 
     Raises:
         ValueError: the two do not cover the same scenes and pairs.
@@ -191,3 +191,84 @@ def percentile_interval(values: FloatArray, level: float = 0.95) -> tuple[float,
     tail = 50.0 * (1.0 - level)
     low, high = np.percentile(values, [tail, 100.0 - tail])
     return float(low), float(high)
+
+
+LOGIT_EDGES = tuple(float(edge) for edge in np.arange(-10.0, 10.01, 0.5))
+"""Thresholds of the precision–recall curve; counts hold one bin more: what lies below the first edge, and so on."""
+
+PROBABILITY_BINS = 15
+
+
+@dataclass(frozen=True)
+class ScoreCounts:
+    """Histograms of one pair's matches.
+
+    Attributes:
+        right, wrong: true and false matches by logit: below the first of :data:`LOGIT_EDGES`, between two, above all.
+        bin_count, bin_right, bin_sum: matches, true matches and sum of the probabilities in each of 15 equal bins of
+            probability.
+    """
+
+    right: tuple[int, ...]
+    wrong: tuple[int, ...]
+    bin_count: tuple[int, ...]
+    bin_right: tuple[int, ...]
+    bin_sum: tuple[float, ...]
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> ScoreCounts:
+        """Counts from the fields that ``dataclasses.asdict`` gave."""
+        return cls(**{name: tuple(values) for name, values in fields.items()})
+
+
+def count_scores(logits: ArrayLike, probabilities: ArrayLike, truth: ArrayLike) -> ScoreCounts:
+    """Histograms of M matches: ``logits`` and ``probabilities`` (M,), ``truth`` bool (M,)."""
+    logits, truth = np.asarray(logits, dtype=np.float64), np.asarray(truth, dtype=bool)
+    probabilities = np.asarray(probabilities, dtype=np.float64)
+    # A match counts at a threshold when its logit is above it, not at it.
+    place = np.searchsorted(LOGIT_EDGES, logits, side="left")
+    index = np.minimum((probabilities * PROBABILITY_BINS).astype(int), PROBABILITY_BINS - 1)
+    logit_bins = len(LOGIT_EDGES) + 1
+    return ScoreCounts(
+        right=_integers(np.bincount(place[truth], minlength=logit_bins)),
+        wrong=_integers(np.bincount(place[~truth], minlength=logit_bins)),
+        bin_count=_integers(np.bincount(index, minlength=PROBABILITY_BINS)),
+        bin_right=_integers(np.bincount(index[truth], minlength=PROBABILITY_BINS)),
+        bin_sum=tuple(round(float(v), 4) for v in np.bincount(index, probabilities, minlength=PROBABILITY_BINS)),
+    )
+
+
+def _integers(values: NDArray[np.intp]) -> tuple[int, ...]:
+    return tuple(int(value) for value in values)
+
+
+def precision_recall_curve(pairs: Sequence[ScoreCounts]) -> tuple[FloatArray, FloatArray]:
+    """Precision and recall at each of :data:`LOGIT_EDGES`, the matches of all pairs together.
+
+    Precision is NaN where nothing is accepted, recall where there is no true match.
+    """
+    right, wrong = (np.sum([getattr(pair, side) for pair in pairs], axis=0) for side in ("right", "wrong"))
+    # What lies above edge e: the bins e + 1, e + 2, …
+    kept_right, kept_wrong = (np.cumsum(side[::-1])[::-1][1:].astype(float) for side in (right, wrong))
+    with np.errstate(invalid="ignore"):
+        return kept_right / (kept_right + kept_wrong), kept_right / float(right.sum())
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """Matches whose probability lies in one bin: its mean, 0 … 1, the share of true ones, and how many there are."""
+
+    probability: float
+    share_right: float
+    matches: int
+
+
+def reliability(pairs: Sequence[ScoreCounts]) -> list[ReliabilityBin]:
+    """Mean probability and share of true matches in each bin of probability that holds matches, all pairs together."""
+    count, right, total = (
+        np.sum([getattr(p, f"bin_{name}") for p in pairs], axis=0) for name in ("count", "right", "sum")
+    )
+    return [
+        ReliabilityBin(float(total[i] / count[i]), float(right[i] / count[i]), int(count[i]))
+        for i in np.flatnonzero(count)
+    ]

@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from .pairs import ALL_PAIRS, ALL_SCENES
-from .report import Style, render_table
+from ..tables import MISSING, STYLES, Style, render_table
+from .summary import Summary
 
 NOT_MEASURED = "not measured"
 OTHER_SCENES = "our scenes"
@@ -23,7 +23,7 @@ DATA = Path(__file__).with_name("paper_tables.json")
 
 NOTES = (
     "The paper's P, R and F count logit > 2 and leave out pairs of value 0 or NaN: compare 'the papers' variant'; "
-    "'all pairs' counts logit > 0, a rival's own selection, and every pair.",
+    "'all pairs' counts logit > 0, a baseline's own selection, and every pair.",
     "The paper's poses come without RANSAC: the row of ours to compare is 'network E'.",
     f"'{OTHER_SCENES}': mean over the scenes of our run that are none of the paper's dumps.",
 )
@@ -35,7 +35,7 @@ def load_paper() -> dict[str, Any]:
     return content
 
 
-def format_paper(summary: Mapping[str, Any] | None, style: Style = "text") -> str:
+def format_paper(summary: Summary | None, style: Style = "text") -> str:
     """Both tables with the rows of ``summary`` (None = without), "not measured" where a figure is lacking."""
     paper = load_paper()
     parts = []
@@ -45,25 +45,24 @@ def format_paper(summary: Mapping[str, Any] | None, style: Style = "text") -> st
         for suffix, metrics in table["ours"].items():
             body += [] if summary is None else _our_rows(summary, paper["splits"], suffix, metrics)
         title = f"{table['title']}: {' / '.join(table['metrics'])}, per cent"
-        parts.append(render_table(title, header, body, style))
+        parts.append(render_table(header, body, style, title=title))
     if style != "latex":
         parts.append("\n".join(f"- {note}" for note in (f"Source: {paper['source']}", *NOTES)))
     return "\n\n".join(parts) + "\n"
 
 
 def _our_rows(
-    summary: Mapping[str, Any], splits: Sequence[Mapping[str, str]], suffix: str, metrics: Sequence[str]
+    summary: Summary, splits: Sequence[Mapping[str, str]], suffix: str, metrics: Sequence[str]
 ) -> list[list[str]]:
     """One row for each method that has the metrics at all."""
-    rows = {(row["method"], row["scene"]): row for row in summary["rows"]}
+    figures = {(row.method, row.scene): row.figures for row in summary.rows}
     dumps = [split["dump"] for split in splits]
     body = []
-    for method in dict.fromkeys(row["method"] for row in summary["rows"] if metrics[0] in row):
-        known = [rows.get((method, dump), {}) for dump in dumps]
-        cells = [_join([row.get(metric) for metric in metrics]) for row in known]
-        apart = {*dumps, ALL_SCENES, ALL_PAIRS}
-        others = [row for (name, scene), row in rows.items() if name == method and scene not in apart]
-        means = [_mean([row.get(metric) for row in others]) for metric in metrics]
+    for method in dict.fromkeys(row.method for row in summary.rows if metrics[0] in row.figures):
+        known = [figures.get((method, dump), {}) for dump in dumps]
+        cells = [_join([one.get(metric) for metric in metrics]) for one in known]
+        others = [figures[method, scene] for scene in summary.scenes if scene not in dumps]
+        means = [_mean([one.get(metric) for one in others]) for metric in metrics]
         body.append([method + suffix, *cells, _join(means)])
     return body
 
@@ -76,23 +75,20 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def _join(values: Sequence[float | None]) -> str:
     if all(value is None for value in values):
         return NOT_MEASURED
-    return " / ".join("–" if value is None else f"{value:.2f}" for value in values)
+    return " / ".join(MISSING if value is None else f"{value:.2f}" for value in values)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables; 0 = done, 2 = the file of our figures cannot be read."""
     parser = argparse.ArgumentParser(prog="python -m mgca_filter.evaluation.paper", description="The paper's tables.")
     parser.add_argument("--json", metavar="FILE", help="figures that the evaluation wrote, to stand beside")
-    parser.add_argument("--style", choices=("text", "markdown", "latex"), default="text")
+    parser.add_argument("--style", choices=STYLES, default="text")
     options = parser.parse_args(arguments)
-    summary = None
-    if options.json is not None:
-        try:
-            summary = json.loads(Path(options.json).read_text(encoding="utf-8"))
-            summary["rows"][0]["scene"]
-        except (OSError, ValueError, LookupError, TypeError) as error:
-            print(f"error: {options.json}: not what the evaluation writes ({error!r})", file=sys.stderr)
-            return 2
+    try:
+        summary = None if options.json is None else Summary.read(options.json)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     print(format_paper(summary, options.style), end="")
     return 0
 

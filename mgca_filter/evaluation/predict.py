@@ -6,22 +6,22 @@ import logging
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
 from ..data import PairSource
 from ..data.scene_bundle import ScenePair
 from ..errors import DatasetError
-from ..geometry.epipolar import rotation_error_deg, symmetric_epipolar_distance_squared, translation_error_deg
+from ..geometry.epipolar import rotation_error_deg, translation_error_deg
 from .difficulty import PairProperties
 from .environment import one_thread
 from .methods import UNREADABLE, Answer, Method, PairOutcome
-from .metrics import FAILURE_DEG, PAPER_LOGIT, TRUE_INLIER_DISTANCE_SQUARED, precision_recall_f
+from .metrics import FAILURE_DEG, PAPER_LOGIT, count_scores, precision_recall_f, true_matches
 from .pairs import SceneSelection
-from .progress import Progress
-from .score_counts import count_scores
 from .store import ResultKey, ResultStore
 
 logger = logging.getLogger(__name__)
@@ -68,6 +68,7 @@ def predict(
 
     Raises:
         ValueError: ``seeds`` or ``workers`` is below 1, or two methods share a name.
+        ImportError: ``progress`` without tqdm.
     """
     if seeds < 1 or workers < 1:
         raise ValueError(f"seeds and workers must be at least 1, got {seeds} and {workers}")
@@ -78,10 +79,12 @@ def predict(
     tasks = list(_missing_tasks(methods, selections, keys, store))
     total = sum(len(task.indices) for task in tasks)
     logger.info("%d pairs to run, the others are in the store", total)
-    with Progress(total, progress) as bar:
+    with _progress_bar(total, progress) as bar:
         for task, outcomes in _run_tasks(tasks, workers):
             store.add(task.key, outcomes)
-            bar.advance(len(outcomes), f"{task.key.method}, {task.key.scene}, seed {task.key.seed}")
+            if bar is not None:
+                bar.set_postfix_str(f"{task.key.method}, {task.key.scene}, seed {task.key.seed}", refresh=False)
+                bar.update(len(outcomes))
     results: dict[str, SceneOutcomes] = {}
     for method in methods:
         results[method.name] = {}
@@ -89,6 +92,15 @@ def predict(
             runs = [store.load(key) for key in keys[method.name, selection.scene]]
             results[method.name][selection.scene] = [[run[index] for index in selection.indices] for run in runs]
     return results
+
+
+def _progress_bar(total: int, shown: bool) -> Any:
+    """A context manager: tqdm's bar over pairs, or None where nothing is to be shown."""
+    if not shown:
+        return nullcontext()
+    from tqdm import tqdm
+
+    return tqdm(total=total, unit="pair", smoothing=0.05)
 
 
 def _result_keys(
@@ -183,7 +195,7 @@ def answer_pair(method: Method, pair: ScenePair, seed: int) -> Answer:
 def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
     """Run a method on one pair and compare its answer with the truth."""
     answer = answer_pair(method, pair, seed)
-    truth = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < TRUE_INLIER_DISTANCE_SQUARED
+    truth = true_matches(pair.correspondences, pair.E)
     rotation_deg = translation_deg = None
     error_deg = FAILURE_DEG
     failure = answer.failure

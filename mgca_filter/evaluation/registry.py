@@ -5,7 +5,7 @@ Selections are ``NN`` (every nearest neighbour), ``mutual``, ``ratio 0.8``, ``GM
 ``PoseLib`` and ``PoseLib progressive``, each with a threshold such as ``0.75 px``. A number of iterations after it
 (``PROSAC 0.5 px 20000 iterations``) makes a time-matched row, which spends them all. ``network order`` in front of
 ``PROSAC`` or ``PoseLib progressive`` sorts the matches by the network's scores instead of the ratio. The filter's own
-rows are listed in :data:`mgca_filter.evaluation.product.VARIANTS`; a selection before them stands for users who filter
+rows are listed in :data:`mgca_filter.evaluation.our_rows.VARIANTS`; a selection before them stands for users who filter
 their matches beforehand.
 """
 
@@ -13,10 +13,16 @@ from __future__ import annotations
 
 import re
 
-from .baselines import Rival
-from .estimators import NEVER_CONFIDENT, DegensacEstimator, Estimator, OpenCvEstimator, PoseLibEstimator
+from .baselines import (
+    NEVER_CONFIDENT,
+    Baseline,
+    DegensacEstimator,
+    Estimator,
+    OpenCvEstimator,
+    PoseLibEstimator,
+)
 from .methods import Method
-from .product import NETWORK_ORDER, VARIANTS, NetworkOrderMethod, ProductMethod
+from .our_rows import NETWORK_ORDER, VARIANTS, NetworkOrderMethod, ProductMethod
 from .selection import Selection
 
 RANSAC_CONFIDENCE = 0.999
@@ -39,7 +45,7 @@ DEFAULT_THRESHOLD_PX = {
 # 0.35 px (better after mutual + ratio 0.8, whose best is 0.25 px). PROSAC and PoseLib stand at the half pixel and the
 # three quarters that were found best for them before. Tried likewise: ACCURATE, DEGENSAC (after ratio 0.8 and 0.9),
 # MAGSAC after mutual and after AdaLAM, PROSAC after AdaLAM at 0.25 or 0.5 to 1 px, LMEDS after ratio 0.7 and 0.8.
-RIVAL_ROWS = (
+BASELINE_ROWS = (
     "NN + RANSAC 3 px",
     "NN + MAGSAC 0.5 px",
     "mutual + MAGSAC 0.75 px",
@@ -103,11 +109,11 @@ def parse_method(name: str, model: str | None = None) -> Method:
     if match is None or not tests:
         raise ValueError(
             f"{name!r} is no method; expected selections and an estimator, such as "
-            f"{RIVAL_ROWS[-1]!r}, or one of {', '.join(VARIANTS)}"
+            f"{BASELINE_ROWS[-1]!r}, or one of {', '.join(VARIANTS)}"
         )
     estimator = _build_estimator(match, name)
     if not by_network:
-        return Rival(selection, estimator)
+        return Baseline(selection, estimator)
     if not estimator.ordered:
         raise ValueError(f"{name!r}: {estimator.name} has no use for an order; expected PROSAC or PoseLib progressive")
     return NetworkOrderMethod(selection, estimator, model)

@@ -1,39 +1,26 @@
-"""Outcomes to figures: one summary, ready for JSON, from which tables and pictures are made."""
+"""What a run of the scoreboard comes to: rows of figures, differences, failures, curves; written to and read from JSON.
+
+``summarize`` makes it from outcomes; ``report``, ``figures`` and ``paper`` show it.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from .curves import precision_recall_curves, recall_curves, reliability_tables
-from .difficulty import PairProperties, figures_by_difficulty
-from .methods import UNREADABLE, PairOutcome
-from .metrics import (
-    FAILURE_DEG,
-    POSE_STATISTICS,
-    FloatArray,
-    SceneErrors,
-    mean_of_the_nonzero,
-    mean_over_pairs,
-    mean_over_scenes,
-    median_error,
-    percentile_interval,
-    resampled_figures,
-)
+from .difficulty import DifficultyTable
+from .metrics import POSE_STATISTICS, ReliabilityBin
 from .pairs import ALL_PAIRS, ALL_SCENES
-from .predict import SceneOutcomes
-from .timing import Timing
+from .timing import TimeMatch
 
 INTERVAL_STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
-COUNTS = ("failures", "unreadable", "paper_dropped", "timed_pairs")
-"""Numbers of pairs, which the mean over scenes adds up; ``pairs`` itself among them."""
 
 NOTES = (
     "mAP, AUC, P, R and F in per cent, errors in degrees; a pair without a pose counts as 180 degrees.",
-    "P, R, F: the decision before the robust fit (rivals: their selection; the filter: logit > 0) over all matches "
+    "P, R, F: the decision before the robust fit (baselines: their selection; the filter: logit > 0) over all matches "
     "against the label 1e-4; mask_P, mask_R, mask_F: the final inliers. Every pair counts.",
     "paper_P, paper_R, paper_F: as published evaluations of the family have them, logit > 2 and pairs whose value is "
     "0 or NaN left out of the mean. Not to be compared with the figures beside them.",
@@ -46,164 +33,328 @@ NOTES = (
 )
 
 
-def scene_errors(outcomes: SceneOutcomes) -> dict[str, FloatArray]:
-    """Pose errors (seeds, pairs) by scene, degrees."""
-    return {
-        scene: np.array([[outcome.error_deg for outcome in run] for run in runs]) for scene, runs in outcomes.items()
-    }
+@dataclass(frozen=True)
+class Decision:
+    """Means of precision, recall and F of a decision about the matches, per cent."""
+
+    P: float
+    R: float
+    F: float
 
 
-def summarize(
-    results: Mapping[str, SceneOutcomes],
-    context: Mapping[str, Any],
-    timing: Timing | None = None,
-    *,
-    reference: str | None = None,
-    replicates: int = 1000,
-    seed: int = 0,
-) -> dict[str, Any]:
-    """Everything a report shows, ready for JSON.
+@dataclass(frozen=True)
+class SummaryRow:
+    """Figures of one method on one scene, on the mean over scenes, or over the pairs of all of them.
 
-    Args:
-        results: outcomes by method, as :func:`predict.predict` returns them.
-        context: written beside the rows as it is: versions, seed, commit, machine, settings.
-        timing: times of the same methods, as :func:`timing.time_methods` returns them; without, rows hold none.
-        reference: method whose differences from every other are listed; None = the first product row, else the last.
-        replicates: of the bootstrap; 0 leaves the intervals and differences out.
-        seed: of the bootstrap.
-
-    Returns:
-        ``rows`` (one per method and scene, then scene "all" = mean over scenes and "pairs" = mean over pairs),
-        ``differences``, ``failures`` (reasons by method), ``unreadable`` (pairs that no method could have solved),
-        ``difficulty`` (figures on easier and harder pairs), ``curves``, ``timing`` and ``notes``, and the context's own
-        fields.
+    Attributes:
+        method: name of the row on the scoreboard.
+        scene: its name, or :data:`pairs.ALL_SCENES`, :data:`pairs.ALL_PAIRS`.
+        pairs: how many.
+        pose: per cent, by the names of :data:`metrics.POSE_STATISTICS`.
+        median_error_deg, median_rotation_deg, median_translation_deg: of the pose error and of its two parts.
+        kept, mask: the decision before and after the robust fit.
+        failures, unreadable: pairs without a pose and pairs that could not be read, mean over seeds.
+        paper: the decision as published evaluations of the family count it; None without logits.
+        paper_dropped: pairs that it leaves out.
+        median_ms, p95_ms, timed_pairs: wall clock, and on how many pairs; None where it was not taken.
+        intervals: 95 % bootstrap intervals of :data:`INTERVAL_STATISTICS`; None where there are none.
     """
-    errors = {name: scene_errors(outcomes) for name, outcomes in results.items()}
-    times = {} if timing is None else timing.milliseconds
-    rows = [
-        row
-        for name, outcomes in results.items()
-        for row in _method_rows(name, outcomes, errors[name], times.get(name, {}))
-    ]
-    differences: list[dict[str, Any]] = []
-    if replicates > 0:
-        resampled = {name: _resampled(scenes, replicates, seed) for name, scenes in errors.items()}
-        for row in rows:
-            if row["scene"] in resampled[row["method"]]:
-                figures = resampled[row["method"]][row["scene"]]
-                row["intervals"] = {key: percentile_interval(values) for key, values in figures.items()}
-        differences = _differences(errors, resampled, choose_reference(list(results), reference))
-    return {
-        "rows": rows,
-        "differences": differences,
-        "failures": {name: _failures(outcomes) for name, outcomes in results.items()},
-        "unreadable": _unreadable(results),
-        "difficulty": figures_by_difficulty(errors, _properties(results)),
-        "curves": {
-            "recall": recall_curves(errors),
-            "precision_recall": precision_recall_curves(results),
-            "reliability": reliability_tables(results),
-        },
-        "timing": None if timing is None else {"machine": timing.machine, "others_load": timing.others_load},
-        "notes": list(NOTES),
-        **context,
-    }
 
+    method: str
+    scene: str
+    pairs: int
+    pose: Mapping[str, float]
+    median_error_deg: float
+    kept: Decision
+    mask: Decision
+    median_rotation_deg: float
+    median_translation_deg: float
+    failures: float
+    unreadable: float
+    paper: Decision | None = None
+    paper_dropped: float | None = None
+    median_ms: float | None = None
+    p95_ms: float | None = None
+    timed_pairs: int | None = None
+    intervals: Mapping[str, tuple[float, float]] | None = None
 
-def _method_rows(
-    name: str, outcomes: SceneOutcomes, errors: SceneErrors, times: Mapping[str, list[float]]
-) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    for scene, runs in outcomes.items():
-        figures = {key: 100.0 * float(statistic(errors[scene])) for key, statistic in POSE_STATISTICS.items()}
-        figures["median_error_deg"] = float(median_error(errors[scene]))
-        rows.append(
-            {
-                "method": name,
-                "scene": scene,
-                "pairs": len(runs[0]),
-                **figures,
-                **_decisions(runs),
-                **_times(times.get(scene, [])),
-            }
+    @property
+    def figures(self) -> dict[str, float]:
+        """All that is known, by the names that tables and JSON use: ``mAP@5``, ``P``, ``mask_P``, ``median_ms`` …"""
+        decisions = (("", self.kept), ("mask_", self.mask), ("paper_", self.paper))
+        known: dict[str, float | None] = {
+            **self.pose,
+            "median_error_deg": self.median_error_deg,
+            **{prefix + name: v for prefix, one in decisions if one is not None for name, v in asdict(one).items()},
+            "median_rotation_deg": self.median_rotation_deg,
+            "median_translation_deg": self.median_translation_deg,
+            "paper_dropped": self.paper_dropped,
+            "failures": self.failures,
+            "unreadable": self.unreadable,
+            "median_ms": self.median_ms,
+            "p95_ms": self.p95_ms,
+            "timed_pairs": self.timed_pairs,
+        }
+        return {name: value for name, value in known.items() if value is not None}
+
+    @classmethod
+    def of(cls, method: str, scene: str, pairs: int, figures: Mapping[str, float]) -> SummaryRow:
+        """Row from what :attr:`figures` gives; the papers' variant and times may be lacking.
+
+        Raises:
+            KeyError: another figure is lacking.
+        """
+        kept, mask = (Decision(*(figures[prefix + name] for name in "PRF")) for prefix in ("", "mask_"))
+        paper = Decision(*(figures[f"paper_{name}"] for name in "PRF")) if "paper_P" in figures else None
+        alike = ("median_error_deg", "median_rotation_deg", "median_translation_deg", "failures", "unreadable")
+        optional = ("paper_dropped", "median_ms", "p95_ms", "timed_pairs")
+        others: dict[str, Any] = {**{name: figures[name] for name in alike}, **{n: figures.get(n) for n in optional}}
+        return cls(
+            method=method,
+            scene=scene,
+            pairs=pairs,
+            pose={name: figures[name] for name in POSE_STATISTICS},
+            kept=kept,
+            mask=mask,
+            paper=paper,
+            **others,
         )
-    pairs = sum(row["pairs"] for row in rows)
-    # The papers' variant and times are lacking where not one pair of a scene could be read.
-    keys = dict.fromkeys(key for row in rows for key in row if key not in ("method", "scene", "pairs"))
-    columns = {key: [row[key] for row in rows if key in row] for key in keys}
-    mean = {key: float(np.mean(values)) for key, values in columns.items() if key not in COUNTS}
-    sums = {key: sum(columns[key]) for key in COUNTS if key in columns}
-    headline = {"method": name, "scene": ALL_SCENES, "pairs": pairs, **mean, **sums}
-    pooled_runs = [[outcome for runs in outcomes.values() for outcome in runs[s]] for s in range(_seeds(outcomes))]
-    pooled = {key: 100.0 * mean_over_pairs(statistic, errors) for key, statistic in POSE_STATISTICS.items()}
-    pooled["median_error_deg"] = mean_over_pairs(median_error, errors)
-    pooled_row = {
-        "method": name,
-        "scene": ALL_PAIRS,
-        "pairs": pairs,
-        **pooled,
-        **_decisions(pooled_runs),
-        **_times([value for scene in times.values() for value in scene]),
-    }
-    return [*rows, headline, pooled_row]
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as it is written: all figures side by side."""
+        intervals = {} if self.intervals is None else {"intervals": {k: list(v) for k, v in self.intervals.items()}}
+        return {"method": self.method, "scene": self.scene, "pairs": self.pairs, **self.figures, **intervals}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> SummaryRow:
+        """Row from what :meth:`to_json` gave."""
+        row = cls.of(content["method"], content["scene"], content["pairs"], content)
+        intervals = content.get("intervals")
+        return row if intervals is None else replace(row, intervals={k: (v[0], v[1]) for k, v in intervals.items()})
 
 
-def _seeds(outcomes: SceneOutcomes) -> int:
-    return len(next(iter(outcomes.values())))
+@dataclass(frozen=True)
+class Difference:
+    """Reference minus another method: mean over scenes, in percentage points, and its 95 % paired bootstrap interval.
 
-
-def _decisions(runs: list[list[PairOutcome]]) -> dict[str, float]:
-    """Means of P, R and F over pairs and seeds, medians of both parts of the error, numbers of pairs per seed."""
-    outcomes = [outcome for run in runs for outcome in run]
-    kept = 100.0 * np.mean([outcome.kept for outcome in outcomes], axis=0)
-    mask = 100.0 * np.mean([outcome.mask for outcome in outcomes], axis=0)
-    figures = dict(zip(("P", "R", "F", "mask_P", "mask_R", "mask_F"), (float(v) for v in (*kept, *mask))))
-    for part in ("rotation_deg", "translation_deg"):
-        values = [FAILURE_DEG if getattr(o, part) is None else getattr(o, part) for o in outcomes]
-        figures[f"median_{part}"] = float(np.median(values))
-    paper = [outcome.paper for outcome in outcomes if not outcome.unreadable]
-    if paper and all(values is not None for values in paper):
-        for key, values in zip(("paper_P", "paper_R", "paper_F"), zip(*paper)):
-            mean, dropped = mean_of_the_nonzero(values)
-            figures |= {key: 100.0 * mean, "paper_dropped": dropped / len(runs)}
-    figures["failures"] = sum(bool(outcome.failure) for outcome in outcomes) / len(runs)
-    figures["unreadable"] = sum(outcome.unreadable for outcome in outcomes) / len(runs)
-    return figures
-
-
-def _times(milliseconds: Sequence[float]) -> dict[str, float]:
-    """Median and 95th percentile, and on how many pairs; nothing without any."""
-    if not milliseconds:
-        return {}
-    median, p95 = np.percentile(milliseconds, [50, 95])
-    return {"median_ms": float(median), "p95_ms": float(p95), "timed_pairs": len(milliseconds)}
-
-
-def _resampled(errors: SceneErrors, replicates: int, seed: int) -> dict[str, dict[str, FloatArray]]:
-    """By scene, and for the mean over scenes, figures (replicates,) in per cent on resampled pairs.
-
-    The draws are the same for all methods, so that they can be paired.
+    ``figures`` has (difference, low, high) by the names of :data:`INTERVAL_STATISTICS`.
     """
-    figures: dict[str, dict[str, FloatArray]] = {scene: {} for scene in (*errors, ALL_SCENES)}
-    for key in INTERVAL_STATISTICS:
-        values = 100.0 * resampled_figures(errors, POSE_STATISTICS[key], replicates=replicates, seed=seed)
-        for scene, scene_values in zip(errors, values):
-            figures[scene][key] = scene_values
-        figures[ALL_SCENES][key] = values.mean(axis=0)
-    return figures
+
+    method: str
+    minus: str
+    figures: Mapping[str, tuple[float, float, float]]
+
+    def to_json(self) -> dict[str, Any]:
+        """The difference as it is written."""
+        return {"method": self.method, "minus": self.minus, **{k: list(v) for k, v in self.figures.items()}}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Difference:
+        """Difference from what :meth:`to_json` gave."""
+        figures = {key: tuple(content[key]) for key in INTERVAL_STATISTICS}
+        return cls(content["method"], content["minus"], figures)
 
 
-def choose_reference(names: Sequence[str], reference: str | None) -> str:
-    """The row that others are compared with: the one named, else the first product row, else the last.
+@dataclass(frozen=True)
+class UnreadablePair:
+    """A pair that no method could have solved, and why."""
 
-    Raises:
-        ValueError: the one named is not among the names.
+    scene: str
+    pair: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class RecallCurves:
+    """Limits from 0 to 20 degrees, and by method the share of pairs below each, mean over scenes."""
+
+    error_deg: list[float]
+    methods: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class PrecisionRecallCurve:
+    """Precision and recall at each threshold; None where no scene has a value."""
+
+    precision: list[float | None]
+    recall: list[float | None]
+
+
+@dataclass(frozen=True)
+class PrecisionRecallCurves:
+    """Thresholds of the logit, and the curves by method: matches of a scene together, mean over scenes."""
+
+    logit: list[float]
+    methods: dict[str, PrecisionRecallCurve]
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Bins of probability over all pairs, and their mean gap, 0 … 1.
+
+    The gap is the expected calibration error (Naeini et al., AAAI 2015).
     """
-    if reference is not None:
-        if reference not in names:
-            raise ValueError(f"reference {reference!r} is not among the methods: {', '.join(names)}")
-        return reference
-    return next((name for name in names if name.endswith("product")), names[-1])
+
+    bins: list[ReliabilityBin]
+    error: float
+
+
+@dataclass(frozen=True)
+class Curves:
+    """What pictures show besides rows; methods without logits are in ``recall`` alone."""
+
+    recall: RecallCurves
+    precision_recall: PrecisionRecallCurves
+    reliability: dict[str, Reliability]
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Curves:
+        """Curves from what ``dataclasses.asdict`` gave."""
+        scored = content["precision_recall"]
+        return cls(
+            RecallCurves(**content["recall"]),
+            PrecisionRecallCurves(
+                scored["logit"], {name: PrecisionRecallCurve(**curve) for name, curve in scored["methods"].items()}
+            ),
+            {
+                name: Reliability([ReliabilityBin(**one) for one in table["bins"]], table["error"])
+                for name, table in content["reliability"].items()
+            },
+        )
+
+
+@dataclass(frozen=True)
+class TimingConditions:
+    """The processor that times were taken on, and how many processors other programs used meanwhile."""
+
+    machine: str
+    others_load: float
+
+
+@dataclass(frozen=True)
+class NotInstalled:
+    """A method whose package is missing, and what the import says."""
+
+    method: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Context:
+    """What the figures depend on besides the methods' answers.
+
+    Attributes:
+        seed: of the draw of pairs and of the bootstrap.
+        versions: of the libraries, by package. commit: of the source; None outside a checkout. machine: what it is.
+        settings: of the run: format, caps, seeds, digests of the data, options of every method; JSON values.
+        not_installed: methods that could not run. time_matched: rows with the iterations that take as long as ours.
+    """
+
+    seed: int | None = None
+    versions: Mapping[str, str] = field(default_factory=dict)
+    commit: str | None = None
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    not_installed: tuple[NotInstalled, ...] = ()
+    time_matched: tuple[TimeMatch, ...] = ()
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Context:
+        """Context from the fields of a summary that are its own; all of them may be lacking."""
+        names = ("seed", "versions", "commit", "machine", "settings")
+        plain = {name: content[name] for name in names if name in content}
+        return cls(
+            **plain,
+            not_installed=tuple(NotInstalled(**item) for item in content.get("not_installed", ())),
+            time_matched=tuple(TimeMatch(**match) for match in content.get("time_matched", ())),
+        )
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Everything that a report shows.
+
+    Attributes:
+        rows: one per method and scene, then that method's mean over scenes and mean over pairs.
+        differences: reference minus every other method; empty without a bootstrap.
+        failures: by method, how often for which reason, all seeds counted.
+        unreadable: pairs that no method could have solved.
+        difficulty: figures on easier and harder pairs.
+        curves: None in files that have none.
+        timing: None where no times were taken.
+        notes: how to read the figures.
+        context: what the figures depend on besides the answers.
+    """
+
+    rows: Sequence[SummaryRow]
+    differences: Sequence[Difference]
+    failures: Mapping[str, Mapping[str, int]]
+    unreadable: Sequence[UnreadablePair]
+    difficulty: Sequence[DifficultyTable]
+    curves: Curves | None
+    timing: TimingConditions | None
+    notes: tuple[str, ...] = NOTES
+    context: Context = Context()
+
+    def rows_of(self, scene: str) -> list[SummaryRow]:
+        """Rows of all methods on one scene, or on one of the means."""
+        return [row for row in self.rows if row.scene == scene]
+
+    @property
+    def scenes(self) -> list[str]:
+        """Names of the scenes, without those of the means."""
+        return list(dict.fromkeys(row.scene for row in self.rows if row.scene not in (ALL_SCENES, ALL_PAIRS)))
+
+    @property
+    def timed_pairs(self) -> int:
+        """Number of pairs that the times were taken on; 0 without times."""
+        return max((row.timed_pairs or 0 for row in self.rows_of(ALL_PAIRS)), default=0)
+
+    def to_json(self) -> dict[str, Any]:
+        """The summary as ``--json`` writes it; the context's fields stand beside the others."""
+        return {
+            "rows": [row.to_json() for row in self.rows],
+            "differences": [difference.to_json() for difference in self.differences],
+            "failures": self.failures,
+            "unreadable": [asdict(pair) for pair in self.unreadable],
+            "difficulty": [asdict(table) for table in self.difficulty],
+            **({} if self.curves is None else {"curves": asdict(self.curves)}),
+            "timing": None if self.timing is None else asdict(self.timing),
+            "notes": list(self.notes),
+            **asdict(self.context),
+        }
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> Summary:
+        """Summary from what :meth:`to_json` gave.
+
+        Raises:
+            KeyError, TypeError: something is lacking, or is not what it should be.
+        """
+        curves, timing = content.get("curves"), content["timing"]
+        return cls(
+            rows=[SummaryRow.from_json(row) for row in content["rows"]],
+            differences=[Difference.from_json(one) for one in content["differences"]],
+            failures=content["failures"],
+            unreadable=[UnreadablePair(**one) for one in content["unreadable"]],
+            difficulty=[DifficultyTable.from_json(table) for table in content["difficulty"]],
+            curves=None if curves is None else Curves.from_json(curves),
+            timing=None if timing is None else TimingConditions(**timing),
+            notes=tuple(content["notes"]),
+            context=Context.from_json(content),
+        )
+
+    @classmethod
+    def read(cls, path: str | Path) -> Summary:
+        """Summary from a file.
+
+        Raises:
+            ValueError: it is not there, or not what the evaluation writes; the message names it.
+        """
+        try:
+            return cls.from_json(json.loads(Path(path).read_text(encoding="utf-8")))
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: not what the evaluation writes ({error!r})") from error
 
 
 def is_ours(method: str) -> bool:
@@ -211,58 +362,8 @@ def is_ours(method: str) -> bool:
     return "product" in method or "network" in method
 
 
-def best_rival(summary: Mapping[str, Any], reference: str) -> str:
+def best_baseline(rows: Sequence[SummaryRow], reference: str) -> str:
     """The row of the highest mAP@20 beside the reference, not one of ours where there are others; alone, itself."""
-    others = [row for row in summary["rows"] if row["scene"] == ALL_SCENES and row["method"] != reference]
-    rivals = [row for row in others if not is_ours(row["method"])] or others
-    return str(max(rivals, key=lambda row: row["mAP@20"])["method"]) if rivals else reference
-
-
-def _differences(
-    errors: Mapping[str, SceneErrors], resampled: Mapping[str, Mapping[str, Mapping[str, FloatArray]]], reference: str
-) -> list[dict[str, Any]]:
-    """Reference minus each other method, mean over scenes, per cent points, with 95 % paired bootstrap intervals."""
-    differences = []
-    for name in errors:
-        if name == reference:
-            continue
-        entry: dict[str, Any] = {"method": reference, "minus": name}
-        for key in INTERVAL_STATISTICS:
-            statistic = POSE_STATISTICS[key]
-            value = mean_over_scenes(statistic, errors[reference]) - mean_over_scenes(statistic, errors[name])
-            apart = resampled[reference][ALL_SCENES][key] - resampled[name][ALL_SCENES][key]
-            entry[key] = [100.0 * value, *percentile_interval(apart)]
-        differences.append(entry)
-    return differences
-
-
-def _failures(outcomes: SceneOutcomes) -> dict[str, int]:
-    """Number of failures by reason, all seeds counted."""
-    counter = Counter(o.failure for runs in outcomes.values() for run in runs for o in run if o.failure)
-    return dict(counter.most_common())
-
-
-def _properties(results: Mapping[str, SceneOutcomes]) -> list[PairProperties | None]:
-    """How hard each pair is, scene by scene: from any outcome that says so, since older ones may not."""
-    found = {
-        (scene, outcome.pair): outcome.properties
-        for outcomes in results.values()
-        for scene, runs in outcomes.items()
-        for run in runs
-        for outcome in run
-        if outcome.properties is not None
-    }
-    first = next(iter(results.values()))
-    return [found.get((scene, outcome.pair)) for scene, runs in first.items() for outcome in runs[0]]
-
-
-def _unreadable(results: Mapping[str, SceneOutcomes]) -> list[dict[str, Any]]:
-    """Scene, index and reason of each pair that could not be read; every method fails on it alike."""
-    found = {
-        (scene, outcome.pair): outcome.failure.removeprefix(UNREADABLE)
-        for outcomes in results.values()
-        for scene, runs in outcomes.items()
-        for outcome in runs[0]
-        if outcome.unreadable
-    }
-    return [{"scene": scene, "pair": pair, "reason": reason} for (scene, pair), reason in found.items()]
+    others = [row for row in rows if row.scene == ALL_SCENES and row.method != reference]
+    baselines = [row for row in others if not is_ours(row.method)] or others
+    return max(baselines, key=lambda row: row.pose["mAP@20"]).method if baselines else reference

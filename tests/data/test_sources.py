@@ -16,8 +16,7 @@ from mgca_filter.data import open_sources
 from mgca_filter.data.colmap import covisible_pairs
 from mgca_filter.data.pair_lists import turn_camera
 from mgca_filter.errors import DatasetError
-from mgca_filter.evaluation.baselines import Rival
-from mgca_filter.evaluation.estimators import OpenCvEstimator
+from mgca_filter.evaluation.baselines import Baseline, OpenCvEstimator
 from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import parse_method
@@ -266,7 +265,7 @@ def test_a_reconstruction_gives_its_covisible_pairs(photos: Path, tmp_path: Path
     np.testing.assert_allclose(pair.R, R_TRUE, atol=1e-9)
     np.testing.assert_allclose(pair.t, T_TRUE, atol=1e-9)
     np.testing.assert_allclose(pair.K1, K)  # COLMAP's 320, 240 are 319.5, 239.5 from the first pixel's centre
-    method = Rival(Selection(mutual=True), OpenCvEstimator("MAGSAC", 0.5))
+    method = Baseline(Selection(mutual=True), OpenCvEstimator("MAGSAC", 0.5))
     (outcome,) = predict([method], select_pairs(tmp_path / "walls", data_format="colmap"))[method.name]["walls"][0]
     assert outcome.error_deg < 3.0
 

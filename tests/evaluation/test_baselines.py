@@ -1,4 +1,4 @@
-"""Rivals of other libraries, and the network's order."""
+"""Baselines of other libraries, and the network's order."""
 
 from __future__ import annotations
 

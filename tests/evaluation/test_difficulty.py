@@ -23,7 +23,7 @@ from mgca_filter.evaluation.pairs import select_pairs
 from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.report import format_report
-from mgca_filter.evaluation.summary import summarize
+from mgca_filter.evaluation.summarize import summarize
 from mgca_filter.inputs.attributes import candidate_mask
 
 
@@ -73,30 +73,30 @@ def test_figures_of_each_group_by_hand():
     errors["theirs"] = {"a": np.array([[180.0, 180.0], [1.0, 180.0]]), "b": np.array([[180.0, 180.0], [1.0, 1.0]])}
     properties = [PairProperties(0.01, 100, 2.0), PairProperties(0.5, 100, 2.0), None, PairProperties(0.01, 900, None)]
     share, candidates, angle = figures_by_difficulty(errors, properties)
-    assert share["property"] == GROUPINGS[0].title
-    assert [(group["group"], group["pairs"]) for group in share["groups"]] == [
+    assert share.property == GROUPINGS[0].title
+    assert [(group.group, group.pairs) for group in share.groups] == [
         *(("below 5 %", 2), ("from 20 %", 1), (UNKNOWN, 1))
     ]
-    low, high, unknown = (group["methods"] for group in share["groups"])
+    low, high, unknown = (group.methods for group in share.groups)
     assert low["ours"] == {"mAP@5": 100.0, "mAP@20": 100.0}
     assert low["theirs"] == {"mAP@5": 50.0, "mAP@20": 50.0}
     assert high["ours"] == {"mAP@5": 0.0, "mAP@20": 75.0}
     assert unknown["ours"] == {"mAP@5": 0.0, "mAP@20": 0.0}
-    assert [(group["group"], group["pairs"]) for group in candidates["groups"]] == [
+    assert [(group.group, group.pairs) for group in candidates.groups] == [
         *(("below 400", 2), ("from 700", 1), (UNKNOWN, 1))
     ]
-    assert [(group["group"], group["pairs"]) for group in angle["groups"]] == [("below 5°", 2), (UNKNOWN, 2)]
+    assert [(group.group, group.pairs) for group in angle.groups] == [("below 5°", 2), (UNKNOWN, 2)]
 
 
 def test_every_pair_is_in_one_group_of_the_report(tmp_path: Path):
     scenes = [make_scene(right=right, wrong=100, seed=right) for right in (4, 30, 100)]
     write_bundle(tmp_path / "hall.npz", scenes)
     results = predict([parse_method("NN + MAGSAC 0.5 px")], select_pairs(tmp_path), seeds=1)
-    summary = summarize(results, {}, replicates=0)
-    for entry in summary["difficulty"]:
-        assert sum(group["pairs"] for group in entry["groups"]) == len(scenes)
-        pooled = sum(g["pairs"] * g["methods"]["NN + MAGSAC 0.5 px"]["mAP@20"] for g in entry["groups"]) / len(scenes)
-        assert pooled == pytest.approx(summary["rows"][-1]["mAP@20"])
+    summary = summarize(results, replicates=0)
+    for entry in summary.difficulty:
+        assert sum(group.pairs for group in entry.groups) == len(scenes)
+        pooled = sum(g.pairs * g.methods["NN + MAGSAC 0.5 px"]["mAP@20"] for g in entry.groups) / len(scenes)
+        assert pooled == pytest.approx(summary.rows[-1].pose["mAP@20"])
     text = format_report(summary, "text")
     assert "mAP@20 by share of right matches among the raw ones (number of pairs)" in text
     assert "from 20 % (2)" in text
@@ -112,5 +112,5 @@ def test_outcomes_that_do_not_know_take_it_from_those_that_do():
         return PairOutcome(0, 180.0, None, None, nothing, nothing, "no pose", properties=properties)
 
     results = {"old": {"hall": [[outcome(None)]]}, "new": {"hall": [[outcome(None)], [outcome(known)]]}}
-    groups = [entry["groups"][0]["group"] for entry in summarize(results, {}, replicates=0)["difficulty"]]
+    groups = [table.groups[0].group for table in summarize(results, replicates=0).difficulty]
     assert groups == ["from 20 %", "500 – 700", "15 – 30°"]

@@ -1,4 +1,4 @@
-"""The scoreboard on synthetic bundles: rivals, product rows, workers, resumption, reports."""
+"""The scoreboard on synthetic bundles: baselines, product rows, workers, resumption, reports."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.evaluation import predict as predict_module
 from mgca_filter.evaluation.__main__ import main
+from mgca_filter.evaluation.baselines import OpenCvEstimator, PoseLibEstimator, estimate_from_essential
 from mgca_filter.evaluation.environment import BUSY_LOAD, CpuMeter
-from mgca_filter.evaluation.estimators import OpenCvEstimator, PoseLibEstimator, estimate_from_essential
 from mgca_filter.evaluation.methods import Answer, PairOutcome
 from mgca_filter.evaluation.metrics import precision_recall_f
+from mgca_filter.evaluation.our_rows import pose_by_paper_protocol, pose_without_ransac
 from mgca_filter.evaluation.pairs import draw_indices, iterate_pairs, select_pairs
 from mgca_filter.evaluation.predict import evaluate_pair, predict
-from mgca_filter.evaluation.product import pose_by_paper_protocol, pose_without_ransac
-from mgca_filter.evaluation.registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
+from mgca_filter.evaluation.registry import BASELINE_ROWS, PRODUCT_ROWS, parse_method
 from mgca_filter.evaluation.report import format_report
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.evaluation.store import ResultStore
-from mgca_filter.evaluation.summary import summarize
+from mgca_filter.evaluation.summarize import summarize
+from mgca_filter.evaluation.summary import Context, Summary
 from mgca_filter.evaluation.timing import Timing
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, symmetric_epipolar_distance_squared
 
@@ -125,10 +126,12 @@ def test_bundles_that_cannot_be_used_are_named(folder, tmp_path):
         select_pairs(tmp_path)
 
 
-# Rivals
+# Baselines
 
 
-@pytest.mark.parametrize("name", [*RIVAL_ROWS, *PRODUCT_ROWS, "mutual + ratio 0.8 + product", "NN + ACCURATE 0.5 px"])
+@pytest.mark.parametrize(
+    "name", [*BASELINE_ROWS, *PRODUCT_ROWS, "mutual + ratio 0.8 + product", "NN + ACCURATE 0.5 px"]
+)
 def test_a_rows_name_gives_the_row(name):
     assert parse_method(name).name == name
 
@@ -152,8 +155,8 @@ def test_other_names_are_refused(name):
         parse_method(name)
 
 
-@pytest.mark.parametrize("name", [row for row in RIVAL_ROWS if "GMS" not in row])
-def test_rivals_solve_an_easy_pair(name, pair):
+@pytest.mark.parametrize("name", [row for row in BASELINE_ROWS if "GMS" not in row])
+def test_baselines_solve_an_easy_pair(name, pair):
     for word, package in (("PoseLib", "poselib"), ("AdaLAM", "kornia"), ("DEGENSAC", "pydegensac")):
         if word in name:
             pytest.importorskip(package)
@@ -377,11 +380,14 @@ def test_a_bar_counts_the_pairs_that_are_run(folder, tmp_path, monkeypatch, caps
     assert capsys.readouterr().err == ""
 
 
-def test_without_tqdm_the_log_counts(folder, monkeypatch, caplog):
+def test_without_tqdm_a_bar_is_refused_before_anything_runs(folder, monkeypatch):
     monkeypatch.setitem(sys.modules, "tqdm", None)
-    with caplog.at_level("INFO", logger="mgca_filter"):
-        predict([CountingMethod([])], select_pairs(folder), progress=True)
-    assert "5/5  counting, yard, seed 0" in caplog.text
+    method = CountingMethod([])
+    with pytest.raises(ImportError, match="tqdm"):
+        predict([method], select_pairs(folder), progress=True)
+    assert method.seen == []
+    predict([method], select_pairs(folder))
+    assert len(method.seen) == 5
 
 
 def test_stored_results_are_reused_only_for_equal_data_and_settings(folder, tmp_path, monkeypatch):
@@ -439,59 +445,62 @@ def outcome(pair: int, error_deg: float, failure: str = "", kept: float = 0.5) -
 def small_results() -> dict[str, Any]:
     ours = {"hall": [[outcome(0, 1.0), outcome(1, 180.0, "no model")]], "yard": [[outcome(0, 7.0, kept=1.0)]]}
     theirs = {"hall": [[outcome(0, 30.0), outcome(1, 1.0)]] * 2, "yard": [[outcome(0, 30.0)], [outcome(0, 1.0)]]}
-    return {"product": ours, "rival": theirs}
+    return {"product": ours, "baseline": theirs}
 
 
 def test_summary_rows_by_scene_over_scenes_and_over_pairs():
     milliseconds = {"hall": [10.0, 20.0], "yard": [10.0]}
-    timing = Timing({"product": milliseconds, "rival": milliseconds}, "Abacus", 0.0)
-    summary = summarize(small_results(), {"commit": "abc"}, timing, replicates=50)
-    rows = {(row["method"], row["scene"]): row for row in summary["rows"]}
+    timing = Timing({"product": milliseconds, "baseline": milliseconds}, "Abacus", 0.0)
+    summary = summarize(small_results(), Context(commit="abc"), timing, replicates=50)
+    rows = {(row.method, row.scene): row for row in summary.rows}
     assert [scene for method, scene in rows if method == "product"] == ["hall", "yard", "all", "pairs"]
-    assert rows["product", "hall"]["mAP@5"] == 50.0
-    assert rows["product", "all"]["mAP@5"] == pytest.approx(25.0)
-    assert rows["product", "pairs"]["mAP@5"] == pytest.approx(100 / 3)
-    assert rows["product", "all"]["mAP@20"] == pytest.approx((50 + 75) / 2)
-    assert rows["product", "all"]["F"] == pytest.approx(75.0)
-    assert rows["product", "pairs"]["F"] == pytest.approx(200 / 3)
-    assert rows["product", "all"]["median_ms"] == pytest.approx((15 + 10) / 2)
-    assert rows["product", "pairs"]["median_ms"] == pytest.approx(10.0)
-    assert rows["product", "pairs"]["p95_ms"] == pytest.approx(19.0)  # nine tenths of the way from 10 to 20
-    assert [rows["product", scene]["timed_pairs"] for scene in ("hall", "yard", "all", "pairs")] == [2, 1, 3, 3]
-    assert rows["product", "all"]["failures"] == 1
-    assert rows["rival", "all"]["mAP@5"] == pytest.approx(50.0)
+    assert rows["product", "hall"].pose["mAP@5"] == 50.0
+    assert rows["product", "all"].pose["mAP@5"] == pytest.approx(25.0)
+    assert rows["product", "pairs"].pose["mAP@5"] == pytest.approx(100 / 3)
+    assert rows["product", "all"].pose["mAP@20"] == pytest.approx((50 + 75) / 2)
+    assert pytest.approx(75.0) == rows["product", "all"].kept.F
+    assert pytest.approx(200 / 3) == rows["product", "pairs"].kept.F
+    assert rows["product", "all"].median_ms == pytest.approx((15 + 10) / 2)
+    assert rows["product", "pairs"].median_ms == pytest.approx(10.0)
+    assert rows["product", "pairs"].p95_ms == pytest.approx(19.0)  # nine tenths of the way from 10 to 20
+    assert [rows["product", scene].timed_pairs for scene in ("hall", "yard", "all", "pairs")] == [2, 1, 3, 3]
+    assert rows["product", "all"].failures == 1
+    assert rows["baseline", "all"].pose["mAP@5"] == pytest.approx(50.0)
     wanted = {"method", "scene", "pairs", "mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms"}
-    assert all(wanted <= set(row) for row in summary["rows"])
-    assert summary["failures"] == {"product": {"no model": 1}, "rival": {}}
-    assert summary["commit"] == "abc"
-    (difference,) = summary["differences"]
-    assert (difference["method"], difference["minus"]) == ("product", "rival")
-    assert difference["mAP@5"][0] == pytest.approx(-25.0)
+    assert all(wanted <= set(row.to_json()) for row in summary.rows)
+    assert summary.failures == {"product": {"no model": 1}, "baseline": {}}
+    assert summary.context.commit == "abc"
+    (difference,) = summary.differences
+    assert (difference.method, difference.minus) == ("product", "baseline")
+    assert difference.figures["mAP@5"][0] == pytest.approx(-25.0)
     # hall has one pair right of two, yard's only pair is wrong
-    assert rows["product", "hall"]["intervals"]["mAP@5"] == (0.0, 100.0)
-    assert rows["product", "yard"]["intervals"]["mAP@5"] == (0.0, 0.0)
-    assert rows["product", "all"]["intervals"]["mAP@5"] == (0.0, 50.0)
-    assert "intervals" not in rows["product", "pairs"]
+    assert rows["product", "hall"].intervals["mAP@5"] == (0.0, 100.0)
+    assert rows["product", "yard"].intervals["mAP@5"] == (0.0, 0.0)
+    assert rows["product", "all"].intervals["mAP@5"] == (0.0, 50.0)
+    assert rows["product", "pairs"].intervals is None
+    written = json.loads(json.dumps(summary.to_json(), allow_nan=False))
+    assert written["rows"][0]["intervals"]["mAP@5"] == [0.0, 100.0]
+    assert Summary.from_json(written) == summary
 
 
 def test_a_single_row_has_its_interval():
     results = {"product": small_results()["product"]}
-    assert "intervals of the headline" in format_report(summarize(results, {}, replicates=10), "text")
-    assert "intervals" not in format_report(summarize(results, {}, replicates=0), "text")
+    assert "intervals of the headline" in format_report(summarize(results, replicates=10), "text")
+    assert "intervals" not in format_report(summarize(results, replicates=0), "text")
 
 
 def test_reference_of_the_differences_can_be_chosen():
-    summary = summarize(small_results(), {}, replicates=10, reference="rival")
-    assert summary["differences"][0]["minus"] == "product"
-    assert summarize(small_results(), {}, replicates=0)["differences"] == []
+    summary = summarize(small_results(), replicates=10, reference="baseline")
+    assert summary.differences[0].minus == "product"
+    assert summarize(small_results(), replicates=0).differences == []
     with pytest.raises(ValueError, match="not among the methods"):
-        summarize(small_results(), {}, replicates=10, reference="somebody")
+        summarize(small_results(), replicates=10, reference="somebody")
 
 
 @pytest.mark.parametrize(("style", "row"), [("text", "product "), ("markdown", "| product"), ("latex", "product &")])
 def test_tables_show_every_row_and_how_it_was_measured(style, row):
-    text = format_report(summarize(small_results(), {"commit": "abc", "seed": 0}, replicates=10), style)
-    for expected in ("mAP@20 by scene", "(rival)", "the final mask", "bootstrap intervals", row):
+    text = format_report(summarize(small_results(), Context(commit="abc", seed=0), replicates=10), style)
+    for expected in ("mAP@20 by scene", "(baseline)", "the final mask", "bootstrap intervals", row):
         assert expected in text
     told = ("no model (1)", "on one thread", "commit: abc")
     assert [words in text for words in told] == [style != "latex"] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -13,20 +14,26 @@ from conftest import SIZE, make_scene
 from scene_bundles import write_bundle
 
 from mgca_filter.evaluation.__main__ import main
-from mgca_filter.evaluation.curves import precision_recall_curves, recall_curves, reliability_tables
-from mgca_filter.evaluation.figures import draw_figures
+from mgca_filter.evaluation.figures import draw_figures, draw_pairs
 from mgca_filter.evaluation.methods import UNREADABLE, PairOutcome
+from mgca_filter.evaluation.metrics import LOGIT_EDGES, count_scores, precision_recall_curve, reliability
 from mgca_filter.evaluation.pairs import sample_pairs, select_pairs
 from mgca_filter.evaluation.paper import format_paper, load_paper
 from mgca_filter.evaluation.paper import main as paper_main
 from mgca_filter.evaluation.predict import predict
-from mgca_filter.evaluation.qualitative import draw_pairs
-from mgca_filter.evaluation.registry import PRODUCT_ROWS, RIVAL_ROWS, parse_method
+from mgca_filter.evaluation.registry import BASELINE_ROWS, PRODUCT_ROWS, parse_method
 from mgca_filter.evaluation.report import format_report
-from mgca_filter.evaluation.score_counts import LOGIT_EDGES, count_scores, precision_recall_curve, reliability
 from mgca_filter.evaluation.store import ResultKey, ResultStore
-from mgca_filter.evaluation.summary import best_rival, is_ours, summarize
-from mgca_filter.evaluation.timing import Timing
+from mgca_filter.evaluation.summarize import precision_recall_curves, recall_curves, reliability_tables, summarize
+from mgca_filter.evaluation.summary import (
+    Context,
+    NotInstalled,
+    Summary,
+    UnreadablePair,
+    best_baseline,
+    is_ours,
+)
+from mgca_filter.evaluation.timing import TimeMatch, Timing
 
 LOGITS = np.array([-11.0, -1.0, 0.0, 1.0, 2.0, 3.0])
 TRUTH = np.array([False, False, True, True, False, True])
@@ -44,15 +51,15 @@ def scored(pair: int, error_deg: float, paper: tuple[float, float, float]) -> Pa
     return outcome(pair, error_deg, paper=paper, counts=count_scores(LOGITS, PROBABILITIES, TRUTH))
 
 
-def small_summary(**context: Any) -> dict[str, Any]:
+def small_summary(**context: Any) -> Summary:
     ours = [scored(0, 1.0, (0.8, 0.4, 0.5)), scored(1, 7.0, (0.0, 0.0, 0.0))]
     broken = outcome(1, 180.0, kept=(0, 0, 0), mask=(0, 0, 0), failure=f"{UNREADABLE}x: image missing")
     results = {
         "product": {"hall": [[*ours, scored(2, 3.0, (0.6, 0.2, 0.3))]]},
-        "rival": {"hall": [[outcome(0, 2.0), broken, outcome(2, 30.0)]]},
+        "baseline": {"hall": [[outcome(0, 2.0), broken, outcome(2, 30.0)]]},
     }
-    timing = Timing({"product": {"hall": [10.0, 20.0]}, "rival": {"hall": [5.0, 7.0]}}, "Abacus", 0.0)
-    return summarize(results, {"commit": "abc", **context}, timing, replicates=10)
+    timing = Timing({"product": {"hall": [10.0, 20.0]}, "baseline": {"hall": [5.0, 7.0]}}, "Abacus", 0.0)
+    return summarize(results, Context(commit="abc", **context), timing, replicates=10)
 
 
 # Counts and curves
@@ -81,45 +88,47 @@ def test_curve_by_hand():
 
 def test_reliability_by_hand():
     bins = reliability([count_scores([0, 0, 0, 0], [0.1, 0.1, 0.9, 0.9], [False, True, True, True])])
-    assert [(one["probability"], one["share_right"], one["matches"]) for one in bins] == [
+    assert [(one.probability, one.share_right, one.matches) for one in bins] == [
         (pytest.approx(0.1), 0.5, 2),
         (pytest.approx(0.9), 1.0, 2),
     ]
     counts = count_scores([0, 0, 0, 0], [0.1, 0.1, 0.9, 0.9], [False, True, True, True])
     table = reliability_tables({"ours": {"hall": [[outcome(0, 1.0, counts=counts)]]}})["ours"]
-    assert table["error"] == pytest.approx(0.25)
+    assert table.error == pytest.approx(0.25)
 
 
 def test_recall_is_a_mean_over_scenes_and_curves_need_scores():
     curves = recall_curves({"ours": {"a": np.array([[1.0, 9.0]]), "b": np.array([[3.0]])}})
-    at = dict(zip(curves["error_deg"], curves["methods"]["ours"]))
+    at = dict(zip(curves.error_deg, curves.methods["ours"]))
     assert (at[1.0], at[1.5], at[3.5], at[9.5], at[20.0]) == (0.0, 0.25, 0.75, 1.0, 1.0)
-    assert precision_recall_curves({"rival": {"a": [[outcome(0, 1.0)]]}})["methods"] == {}
-    assert reliability_tables({"rival": {"a": [[outcome(0, 1.0)]]}}) == {}
+    assert precision_recall_curves({"baseline": {"a": [[outcome(0, 1.0)]]}}).methods == {}
+    assert reliability_tables({"baseline": {"a": [[outcome(0, 1.0)]]}}) == {}
 
 
 # Summary and tables
 
 
 def test_the_papers_variant_stands_under_its_own_name():
-    rows = {(row["method"], row["scene"]): row for row in small_summary()["rows"]}
+    rows = {(row.method, row.scene): row for row in small_summary().rows}
     ours = rows["product", "all"]
-    assert (ours["paper_P"], ours["paper_R"], ours["paper_F"]) == pytest.approx((70.0, 30.0, 40.0))
-    assert ours["paper_dropped"] == 1
-    assert (ours["P"], ours["mask_P"]) == pytest.approx((50.0, 25.0))
-    assert "paper_P" not in rows["rival", "all"]
+    assert pytest.approx((70.0, 30.0, 40.0)) == (ours.paper.P, ours.paper.R, ours.paper.F)
+    assert ours.paper_dropped == 1
+    assert pytest.approx((50.0, 25.0)) == (ours.kept.P, ours.mask.P)
+    assert [ours.to_json()[name] for name in ("paper_P", "P", "mask_P")] == pytest.approx([70.0, 50.0, 25.0])
+    assert rows["baseline", "all"].paper is None
+    assert "paper_P" not in rows["baseline", "all"].to_json()
 
 
 def test_unreadable_pairs_are_counted_and_listed():
     summary = small_summary()
-    rows = {(row["method"], row["scene"]): row for row in summary["rows"]}
-    rival = rows["rival", "all"]
-    assert (rival["unreadable"], rival["failures"], rival["pairs"]) == (1, 1, 3)
-    assert rival["mAP@5"] == pytest.approx(100 / 3)
-    assert rival["P"] == pytest.approx(100 / 3)
-    assert rival["median_rotation_deg"] == pytest.approx(15.0)
-    assert rival["median_translation_deg"] == pytest.approx(30.0)
-    assert summary["unreadable"] == [{"scene": "hall", "pair": 1, "reason": "x: image missing"}]
+    (baseline,) = [row for row in summary.rows_of("all") if row.method == "baseline"]
+    assert (baseline.unreadable, baseline.failures, baseline.pairs) == (1, 1, 3)
+    assert baseline.pose["mAP@5"] == pytest.approx(100 / 3)
+    assert pytest.approx(100 / 3) == baseline.kept.P
+    assert baseline.median_rotation_deg == pytest.approx(15.0)
+    assert baseline.median_translation_deg == pytest.approx(30.0)
+    assert summary.unreadable == [UnreadablePair("hall", 1, "x: image missing")]
+    assert summary.to_json()["unreadable"] == [{"scene": "hall", "pair": 1, "reason": "x: image missing"}]
     assert "1 pairs could not be read" in format_report(summary, "text")
     assert "hall, pair 1: x: image missing" in format_report(summary, "text")
 
@@ -127,13 +136,38 @@ def test_unreadable_pairs_are_counted_and_listed():
 def test_a_scene_without_readable_pairs_still_counts():
     broken = outcome(0, 180.0, failure=f"{UNREADABLE}x", kept=(0, 0, 0), mask=(0, 0, 0))
     ours = {"a": [[scored(0, 1.0, (0.8, 0.4, 0.5))]], "b": [[broken]]}
-    rows = summarize({"product": ours}, {}, Timing({"product": {"a": [8.0]}}, "Abacus", 0.0), replicates=0)["rows"]
+    summary = summarize({"product": ours}, None, Timing({"product": {"a": [8.0]}}, "Abacus", 0.0), replicates=0)
+    rows = summary.rows
     for row in rows[2:]:
-        assert (row["mAP@5"], row["P"], row["failures"]) == pytest.approx((50.0, 25.0, 1))
-        assert (row["median_ms"], row["timed_pairs"]) == (8.0, 1)
-    assert rows[2]["paper_P"] == rows[0]["paper_P"] == pytest.approx(80.0)
-    assert "median_ms" not in rows[1]
-    assert json.loads(json.dumps(rows, allow_nan=False)) == rows
+        assert (row.pose["mAP@5"], row.kept.P, row.failures) == pytest.approx((50.0, 25.0, 1))
+        assert (row.median_ms, row.timed_pairs) == (8.0, 1)
+    assert rows[2].paper.P == rows[0].paper.P == pytest.approx(80.0)
+    assert rows[1].median_ms is None
+    assert "median_ms" not in rows[1].to_json()
+    assert Summary.from_json(json.loads(json.dumps(summary.to_json(), allow_nan=False))) == summary
+
+
+def test_a_summary_is_what_its_file_says(tmp_path: Path):
+    matched, lacking = TimeMatch("x", 700, "product", 0.8), NotInstalled("NN + DEGENSAC 1 px", "no pydegensac")
+    summary = small_summary(seed=3, settings={"seeds": 2}, time_matched=(matched,), not_installed=(lacking,))
+    content = json.loads(json.dumps(summary.to_json()))
+    (tmp_path / "board.json").write_text(json.dumps(content))
+    assert Summary.read(tmp_path / "board.json") == summary
+    assert (content["seed"], content["commit"], content["settings"]) == (3, "abc", {"seeds": 2})
+    assert content["time_matched"] == [{"method": "x", "iterations": 700, "like": "product", "share": 0.8}]
+    assert content["timing"] == {"machine": "Abacus", "others_load": 0.0}
+    del content["rows"][0]["AUC@5"]
+    (tmp_path / "board.json").write_text(json.dumps(content))
+    with pytest.raises(ValueError, match=r"board\.json.*AUC@5"):
+        Summary.read(tmp_path / "board.json")
+
+
+def test_the_published_scoreboard_can_be_read():
+    path = Path(__file__).parents[2] / "docs" / "scoreboard.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    summary = Summary.read(path)
+    assert json.loads(json.dumps(summary.to_json())) == content
+    assert (len(summary.scenes), summary.timed_pairs) == (11, 33)
 
 
 def test_outcomes_survive_the_store(tmp_path: Path):
@@ -152,10 +186,10 @@ def test_outcomes_survive_the_store(tmp_path: Path):
 
 
 def test_settings_are_printed_with_the_table():
-    settings = {"methods": {"rival": {"estimator": {"kind": "MAGSAC", "max_iterations": 5000}}}}
-    matched = {"method": "x", "iterations": 700, "like": "product", "share": 0.8}
-    lacking = [{"method": "NN + DEGENSAC 1 px", "reason": "No module named 'pydegensac'"}]
-    text = format_report(small_summary(settings=settings, time_matched=[matched], not_installed=lacking), "text")
+    settings = {"methods": {"baseline": {"estimator": {"kind": "MAGSAC", "max_iterations": 5000}}}}
+    matched = TimeMatch("x", 700, "product", 0.8)
+    lacking = NotInstalled("NN + DEGENSAC 1 px", "No module named 'pydegensac'")
+    text = format_report(small_summary(settings=settings, time_matched=(matched,), not_installed=(lacking,)), "text")
     assert "estimator: kind MAGSAC, max_iterations 5000" in text
     assert "x: takes 0.80 times as long as product in the median" in text
     assert "NN + DEGENSAC 1 px  not installed" in text
@@ -177,38 +211,37 @@ def test_latex_escapes_and_balances():
 
 def test_figures_are_written_from_the_summary_alone(tmp_path: Path):
     pytest.importorskip("matplotlib")
-    summary = json.loads(json.dumps(small_summary()))
+    summary = Summary.from_json(json.loads(json.dumps(small_summary().to_json())))
     files = draw_figures(summary, tmp_path / "new", prefix="val_")
     names = ["val_recall.svg", "val_precision_recall.svg", "val_reliability.svg", "val_time_accuracy.svg"]
     assert [file.name for file in files] == names
     for file in files:
         assert "product" in file.read_text()
-    assert "rival" in files[0].read_text()
+    assert "baseline" in files[0].read_text()
     before = [file.read_bytes() for file in files]
     assert [file.read_bytes() for file in draw_figures(summary, tmp_path / "new", prefix="val_")] == before
 
 
 def test_figures_need_what_they_show(tmp_path: Path):
     pytest.importorskip("matplotlib")
-    summary = small_summary()
-    del summary["curves"]  # as older files are
-    assert [file.name for file in draw_figures(summary, tmp_path)] == ["time_accuracy.svg"]
-    for row in summary["rows"]:
+    content = small_summary().to_json()
+    del content["curves"]
+    assert [file.name for file in draw_figures(Summary.from_json(content), tmp_path)] == ["time_accuracy.svg"]
+    for row in content["rows"]:
         row.pop("median_ms", None)
-    assert draw_figures(summary, tmp_path) == []
+    assert draw_figures(Summary.from_json(content), tmp_path) == []
 
 
 def test_our_rows_are_known_by_name():
     assert all(is_ours(name) for name in PRODUCT_ROWS)
-    assert not any(is_ours(name) for name in RIVAL_ROWS)
+    assert not any(is_ours(name) for name in BASELINE_ROWS)
 
 
-def test_the_best_rival_is_pictured_beside_the_reference():
-    summary = small_summary()
-    assert best_rival(summary, "product") == "rival"
-    assert best_rival(summary, "rival") == "product"  # ours where there is nothing else
-    summary["rows"] = [row for row in summary["rows"] if row["method"] == "product"]
-    assert best_rival(summary, "product") == "product"
+def test_the_best_baseline_is_pictured_beside_the_reference():
+    rows = small_summary().rows
+    assert best_baseline(rows, "product") == "baseline"
+    assert best_baseline(rows, "baseline") == "product"  # ours where there is nothing else
+    assert best_baseline([row for row in rows if row.method == "product"], "product") == "product"
 
 
 def test_pictures_of_pairs_show_right_and_wrong(tmp_path: Path):
@@ -287,12 +320,13 @@ def test_ours_stand_beside_the_papers_where_the_data_is():
     assert lines[1].startswith("product, the papers' variant")
     assert "70.00 / 30.00 / 40.00" in lines[1]
     assert "– / " not in lines[2]
-    assert "rival, all pairs" in text
-    assert "rival, the papers' variant" not in text
+    assert "baseline, all pairs" in text
+    assert "baseline, the papers' variant" not in text
     summary = small_summary()
-    for row in summary["rows"]:
-        row["scene"] = {"hall": "yfcc-sift-2000-test"}.get(row["scene"], row["scene"])
-    pose = [line for line in format_paper(summary).splitlines() if line.startswith("product")][-1]
+    named = {"hall": "yfcc-sift-2000-test"}
+    rows = [dataclasses.replace(row, scene=named.get(row.scene, row.scene)) for row in summary.rows]
+    text = format_paper(dataclasses.replace(summary, rows=rows))
+    pose = [line for line in text.splitlines() if line.startswith("product")][-1]
     cells = [cell.strip() for cell in pose.split("  ") if cell.strip()]
     assert [cell == "not measured" for cell in cells[1:]] == [True, False, True, True, True]
 
@@ -300,7 +334,7 @@ def test_ours_stand_beside_the_papers_where_the_data_is():
 def test_paper_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert paper_main([]) == 0
     assert "CGR-Net" in capsys.readouterr().out
-    (tmp_path / "ours.json").write_text(json.dumps(small_summary()))
+    (tmp_path / "ours.json").write_text(json.dumps(small_summary().to_json()))
     assert paper_main(["--json", str(tmp_path / "ours.json"), "--style", "markdown"]) == 0
     assert "| product" in capsys.readouterr().out
     (tmp_path / "other.json").write_text("[]")

@@ -15,13 +15,12 @@ from conftest import SIZE, K, Scene, make_scene
 from scene_bundles import write_bundle
 
 from mgca_filter.data.scene_bundle import ScenePair
-from mgca_filter.evaluation import time_matching, timing
+from mgca_filter.evaluation import timing
 from mgca_filter.evaluation.__main__ import main
 from mgca_filter.evaluation.environment import one_thread
 from mgca_filter.evaluation.methods import Answer
 from mgca_filter.evaluation.store import ResultStore
-from mgca_filter.evaluation.time_matching import match_times
-from mgca_filter.evaluation.timing import interleaved_ms, time_methods
+from mgca_filter.evaluation.timing import interleaved_ms, match_times, time_methods
 from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
 
 NO_STORE = ResultStore(None)
@@ -126,10 +125,10 @@ def test_command_times_as_many_pairs_of_each_scene_as_it_is_told(
 
 @pytest.fixture
 def costing(clocked: Any, monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[int], float], float], ClockedMethod]:
-    """Gives rivals the cost that a function has for their iterations; returns the row to match."""
+    """Gives baselines the cost that a function has for their iterations; returns the row to match."""
 
     def install(cost: Callable[[int], float], target_ms: float) -> ClockedMethod:
-        monkeypatch.setattr(time_matching, "parse_method", lambda name: clocked(name, cost(int(name.split()[-2]))))
+        monkeypatch.setattr(timing, "parse_method", lambda name: clocked(name, cost(int(name.split()[-2]))))
         return clocked("ours", target_ms)
 
     return install
@@ -153,7 +152,7 @@ def test_an_estimator_that_stops_early_says_so(costing: Any, pairs: list[ScenePa
     assert match.share == pytest.approx(0.1)
     assert match.iterations == 16_000  # the most that was tried before it was given up
     like = costing(lambda iterations: 100.0, 50.0)
-    assert match_times(["NN + MAGSAC 1 px"], like, pairs, NO_STORE)[0].iterations == time_matching.MIN_ITERATIONS
+    assert match_times(["NN + MAGSAC 1 px"], like, pairs, NO_STORE)[0].iterations == timing.MIN_ITERATIONS
 
 
 def test_the_iterations_found_are_kept(costing: Any, pairs: list[ScenePair], tmp_path: Path) -> None:
@@ -176,7 +175,7 @@ def test_command_adds_time_matched_rows(
     import mgca_filter.evaluation.__main__ as command
 
     monkeypatch.setattr(command, "TIME_MATCHED_ROWS", ("mutual + PROSAC 0.5 px",))
-    monkeypatch.setattr(time_matching, "MAX_ITERATIONS", 2000)
+    monkeypatch.setattr(timing, "MAX_ITERATIONS", 2000)
     path = write_bundle(tmp_path / "hall.npz", [make_scene()])
     arguments = [str(path), "--methods", "product", "--model", str(model_file), "--time-matched", "product"]
     assert main([*arguments, "--bootstrap", "0", "-q"]) == 0

@@ -1,0 +1,1 @@
+"""Bad input into every entry point: ``matches`` and ``files`` make it, ``promises`` says what must hold."""

@@ -1,0 +1,66 @@
+"""Broken and odd image files, each with the exit statuses that ``mgca-match`` may answer with."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def png_that_promises(width: int, height: int) -> bytes:
+    """A PNG of a few bytes whose header promises ``width`` x ``height`` grey pixels."""
+    header = _chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    return _PNG + header + _chunk(b"IDAT", zlib.compress(b"\0" * 10)) + _chunk(b"IEND", b"")
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def _flat(path: Path, good: bytes) -> None:
+    cv2.imwrite(str(path), np.full((40, 60), 128, np.uint8))
+
+
+def _one_pixel(path: Path, good: bytes) -> None:
+    cv2.imwrite(str(path), np.zeros((1, 1), np.uint8))
+
+
+def _sixteen_bits(path: Path, good: bytes) -> None:
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 65536, (90, 120), dtype=np.uint16))
+
+
+def _with_alpha(path: Path, good: bytes) -> None:
+    cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (90, 120, 4), dtype=np.uint8))
+
+
+def _noise(path: Path, good: bytes) -> None:
+    cv2.imwrite(str(path), np.random.default_rng(1).integers(0, 256, (90, 120), dtype=np.uint8))
+
+
+FILES: dict[str, tuple[Callable[[Path, bytes], object], tuple[int, ...]]] = {
+    "missing": (lambda path, good: path.unlink(missing_ok=True), (2,)),
+    "empty": (lambda path, good: path.write_bytes(b""), (2,)),
+    "text": (lambda path, good: path.write_bytes(b"no image"), (2,)),
+    "cut off in the header": (lambda path, good: path.write_bytes(good[:20]), (2,)),
+    "cut off in the middle": (lambda path, good: path.write_bytes(good[: len(good) // 2]), (0, 1, 2)),
+    "damaged in the middle": (
+        lambda path, good: path.write_bytes(good[:200] + bytes(b ^ 255 for b in good[200:260]) + good[260:]),
+        (0, 1, 2),
+    ),
+    "promises 100 000 x 100 000": (lambda path, good: path.write_bytes(png_that_promises(100_000, 100_000)), (2,)),
+    "promises 30 000 x 30 000": (lambda path, good: path.write_bytes(png_that_promises(30_000, 30_000)), (2,)),
+    "promises 0 x 0": (lambda path, good: path.write_bytes(png_that_promises(0, 0)), (2,)),
+    "one colour": (_flat, (1,)),
+    "one pixel": (_one_pixel, (1,)),
+    "noise": (_noise, (1,)),
+    "16 bits": (_sixteen_bits, (1,)),
+    "with alpha": (_with_alpha, (1,)),
+    "the same image twice": (lambda path, good: path.write_bytes(good), (0,)),
+}
+"""By kind: writes the file, given the bytes of a good one; and the exit statuses that are right."""

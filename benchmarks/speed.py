@@ -1,0 +1,253 @@
+"""How fast is the filter here? ``python -m benchmarks.speed [--threads 2] [--bundle FILE --pair 0]`` prints ratios.
+
+All calls run in turn in one process, on as many threads, on the raw SIFT matches of the example pair (or of a pair of
+a scene bundle); medians. Whole calls have the pose error of their answer beside them. Cold start and memory are
+measured in processes of their own. ``benchmarks.profile_network`` tells where the milliseconds of the network go.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
+from mgca_filter.data.scene_bundle import SceneBundle
+from mgca_filter.data.source import read_image
+from mgca_filter.evaluation.metrics import FAILURE_DEG, true_matches
+from mgca_filter.fit.robust_fit import pose_from_essential
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
+from mgca_filter.inference import open_backend
+from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
+from mgca_filter.tables import MISSING, markdown_head, markdown_row, render_table
+
+FloatArray = NDArray[np.float64]
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples" / "images"
+MAGSAC_ITERATIONS = (1000, 5000, 100_000)  # OpenCV's default; the evaluation's baselines; enough for one right in ten
+MEMORY_COUNTS = (500, 2000, 8000)
+
+COLD_START = """
+import sys, time
+started = time.perf_counter()
+import mgca_filter
+imported = time.perf_counter()
+import numpy as np
+points = np.random.default_rng(0).random((2, 500, 2)) * 500
+mgca_filter.filter_matches(*points, None, backend=sys.argv[1])
+first = time.perf_counter()
+mgca_filter.filter_matches(*points, None, backend=sys.argv[1])
+print(imported - started, first - imported, time.perf_counter() - first)
+"""
+# The peak from /proc (Linux): that of getrusage starts at the parent's.
+MEMORY = """
+import re, sys
+import numpy as np
+import mgca_filter
+from mgca_filter.inference import open_backend
+def peak_mib():
+    return int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1]) / 1024
+before = peak_mib()
+backend, count = open_backend(mgca_filter.model_path(), sys.argv[1]), int(sys.argv[2])
+rng = np.random.default_rng(0)
+backend.infer(rng.random((1, count, 4), dtype=np.float32), rng.random((1, count, 8), dtype=np.float32))
+print(peak_mib() - before)
+"""
+
+
+@dataclass(frozen=True)
+class RawPair:
+    """Raw matches as a user holds them, their pixels (M, 2) under K (3, 3), and the true pose R (3, 3), t (3,)."""
+
+    arguments: tuple[Any, Any, Any]
+    attributes: Any
+    points1: FloatArray
+    points2: FloatArray
+    K1: FloatArray
+    K2: FloatArray
+    R: FloatArray
+    t: FloatArray
+
+    @property
+    def correspondences(self) -> FloatArray:
+        """(M, 4) on the normalised image planes."""
+        return np.hstack([normalize_points(self.points1, self.K1), normalize_points(self.points2, self.K2)])
+
+    @property
+    def inlier_share(self) -> float:
+        """Share of the matches near their true epipolar lines."""
+        return float(np.mean(true_matches(self.correspondences, essential_from_pose(self.R, self.t))))
+
+
+def example_pair() -> RawPair:
+    """SIFT nearest neighbours of the example pair: cv2.KeyPoint and knnMatch rows."""
+    truth = json.loads((EXAMPLES / "pair.json").read_text())
+    K1, K2 = np.array(truth["K1"]), np.array(truth["K2"])
+    image1, image2 = (read_image(EXAMPLES / truth[name]) for name in ("image1", "image2"))
+    matched = match_images(image1, image2, K1=K1, K2=K2)
+    points1 = np.array([matched.keypoints1[row[0].queryIdx].pt for row in matched.matches])
+    points2 = np.array([matched.keypoints2[row[0].trainIdx].pt for row in matched.matches])
+    arguments = (matched.keypoints1, matched.keypoints2, matched.matches)
+    return RawPair(arguments, None, points1, points2, K1, K2, np.array(truth["R"]), np.array(truth["t"]))
+
+
+def bundle_pair(path: Path, index: int) -> RawPair:
+    """Raw matches of a pair of a scene bundle: arrays."""
+    pair = SceneBundle(path)[index]
+    arguments = (pair.points1, pair.points2, None)
+    return RawPair(arguments, pair.attributes, pair.points1, pair.points2, pair.K1, pair.K2, pair.R, pair.t)
+
+
+def magsac(pair: RawPair, iterations: int) -> Any:
+    """The call that the filter replaces, at one pixel: E and mask."""
+    x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
+    threshold = 1.0 / float(np.mean([pair.K1[0, 0], pair.K1[1, 1], pair.K2[0, 0], pair.K2[1, 1]]))
+    return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, iterations)
+
+
+def answer_error_deg(pair: RawPair, answer: Any) -> float | None:
+    """Pose error of what a whole call returned, 180 without a pose; None where it returns no geometry at all."""
+    if isinstance(answer, FilterResult):
+        pose = None if answer.R is None or answer.t is None else (answer.R, answer.t)
+    elif isinstance(answer, tuple):
+        E, mask = answer
+        pose = None if E is None else pose_from_essential(E[:3], pair.correspondences[mask.ravel() > 0])
+    else:
+        return None
+    return FAILURE_DEG if pose is None else pose_error_deg(*pose, pair.R, pair.t)
+
+
+def full_calls(pair: RawPair) -> dict[str, Callable[[], Any]]:
+    """What is compared, by name: whole calls on the raw matches."""
+    filters = MatchFilter(backend="onnxruntime")
+    known = {"K1": pair.K1, "K2": pair.K2, "attributes": pair.attributes}
+    bare = (pair.points1, pair.points2, None)
+    calls: dict[str, Callable[[], Any]] = {
+        "filter_matches, ratio known": lambda: filters.filter(*pair.arguments, **known),
+        "filter_matches, points only": lambda: filters.filter(*bare, K1=pair.K1, K2=pair.K2),
+    }
+    for iterations in MAGSAC_ITERATIONS:
+        calls[f"findEssentialMat(USAC_MAGSAC), {iterations} iterations"] = partial(magsac, pair, iterations)
+    calls["`paper` preset, torch eager, all raw matches"] = paper_pass(len(pair.points1))
+    return calls
+
+
+def paper_pass(count: int) -> Callable[[], Any]:
+    """One forward pass of the reference design with random weights: its time counts, its answer means nothing."""
+    import torch
+
+    from mgca_filter.network import PRESETS, MGCANet
+
+    network = MGCANet(PRESETS["paper"]).eval()
+    inputs = torch.rand(1, count, 4) - 0.5, torch.rand(1, count, 8)
+
+    def run() -> None:
+        with torch.inference_mode():
+            network(*inputs)
+
+    return run
+
+
+def network_input(count: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Correspondences (1, N, 4) and attributes (1, N, 8) at random: time does not depend on what they are."""
+    rng = np.random.default_rng(0)
+    return rng.random((1, count, 4), dtype=np.float32) - 0.5, rng.random((1, count, 8), dtype=np.float32)
+
+
+def network_calls(count: int) -> dict[str, Callable[[], Any]]:
+    """One forward pass of the shipped model in each runtime."""
+    inputs = network_input(count)
+    calls: dict[str, Callable[[], Any]] = {}
+    for name in ("onnxruntime", "opencv", "torch"):
+        try:
+            backend = open_backend(model_path(), name)
+        except BackendError as error:
+            print(f"without {name}: {error}", file=sys.stderr)
+            continue
+        calls[name] = partial(backend.infer, *inputs)
+    return calls
+
+
+def median_ms(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+    """Median duration of each call; they take turns, so that a busy moment hits all."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 1):
+        for name, call in calls.items():
+            started = time.perf_counter()
+            call()
+            if turn:  # the first one warms up
+                times[name].append(1e3 * (time.perf_counter() - started))
+    return {name: float(np.median(values)) for name, values in times.items()}
+
+
+def print_ratios(title: str, times: dict[str, float], errors_deg: dict[str, float | None] | None = None) -> None:
+    """Milliseconds, each as a multiple of the first, and pose errors where they are given."""
+    first = next(iter(times.values()))
+    header = ["", "ms", "ratio", *([] if errors_deg is None else ["pose error"])]
+    body = []
+    for name, value in times.items():
+        cells = [name, f"{value:.1f}", f"{value / first:.2f}"]
+        if errors_deg is not None:
+            error = errors_deg[name]
+            cells.append(MISSING if error is None else f"{error:.1f}°")
+        body.append(cells)
+    print(f"\n{title}:\n\n{render_table(header, body)}")
+
+
+def run_alone(program: str, *arguments: object) -> list[float]:
+    """Numbers that a program prints in a fresh process."""
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return [float(word) for word in subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()]
+
+
+def print_cold_start_and_memory(names: list[str]) -> None:
+    """Seconds from import to the first answer, and how far the process grows at its peak."""
+    print("\nCold start (seconds; best of three) and peak growth of the process, one pass over N matches (MiB):\n")
+    counts = [f"N = {count}" for count in MEMORY_COUNTS]
+    print(markdown_head(["backend", "import", "first call", "next call", *counts]))
+    for name in names:
+        start = min((run_alone(COLD_START, name) for _ in range(3)), key=lambda times: times[0] + times[1])
+        memory = [run_alone(MEMORY, name, count)[0] for count in MEMORY_COUNTS]
+        cells = [f"{value:.2f}" for value in start] + [f"{value:.0f}" for value in memory]
+        print(markdown_row([name, *cells]))
+
+
+def main() -> None:
+    """Print all tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--bundle", type=Path, help="a scene bundle instead of the example pair")
+    parser.add_argument("--pair", type=int, default=0, help="index in the bundle")
+    options = parser.parse_args()
+    os.environ[THREADS_VARIABLE] = os.environ["OMP_NUM_THREADS"] = str(options.threads)
+    cv2.setNumThreads(options.threads)
+    import torch
+
+    torch.set_num_threads(options.threads)
+    pair = bundle_pair(options.bundle, options.pair) if options.bundle else example_pair()
+    threads = f"{options.threads} thread{'s' if options.threads > 1 else ''}"
+    print(f"{len(pair.points1)} raw matches, {100 * pair.inlier_share:.0f} % right; {threads}.")
+    calls = full_calls(pair)
+    errors_deg = {name: answer_error_deg(pair, call()) for name, call in calls.items()}
+    print_ratios("Whole calls", median_ms(calls, options.repeats), errors_deg)
+    for count in (500, 2000):
+        print_ratios(f"One pass of the network, N = {count}", median_ms(network_calls(count), options.repeats))
+    print_cold_start_and_memory(["onnxruntime", "opencv", "torch"])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""The study of the robust fit's steps: its first row is what users get, and each other row changes something."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import make_scene
+from scene_bundles import write_bundle
+
+from benchmarks.fit_ablation import AS_IT_IS, VARIANTS, ScoredPair, Variant, format_study, main
+from mgca_filter import MatchFilter
+from mgca_filter.evaluation.our_rows import filter_pair
+from mgca_filter.evaluation.pairs import select_pairs
+from mgca_filter.geometry.epipolar import pose_error_deg
+
+
+@pytest.fixture
+def scored(tmp_path: Path, model_file: Path) -> ScoredPair:
+    write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
+    return ScoredPair.of(select_pairs(tmp_path)[0].source[0], str(model_file))
+
+
+def test_the_fit_as_it_is_is_what_the_filter_does(scored: ScoredPair, model_file: Path) -> None:
+    pair = scored.pair
+    result = filter_pair(pair, np.arange(len(pair.points1)), str(model_file), {})
+    options = MatchFilter(model=model_file).fit_options
+    expected = pose_error_deg(result.R, result.t, pair.R, pair.t)
+    assert scored.error_deg(VARIANTS[AS_IT_IS], options) == expected
+
+
+def test_every_variant_but_the_first_changes_something() -> None:
+    assert [name for name, variant in VARIANTS.items() if variant == Variant({})] == [AS_IT_IS]
+
+
+def test_the_table_has_means_and_differences() -> None:
+    good, bad = np.array([[1.0, 2.0]]), np.array([[1.0, 180.0]])
+    table = format_study(
+        {AS_IT_IS: {"a": good, "b": good}, "worse": {"a": bad, "b": good}}, {AS_IT_IS: 5.0, "worse": 1.0}
+    )
+    first, second = table.splitlines()[2:]
+    assert first == f"| {AS_IT_IS} | 100.0 | 100.0 | 80.0 |  |  | 5.0 |"
+    assert second.startswith("| worse | 75.0 | 75.0 | 62.5 | -25.0 [-50.0, +0.0] | -17.5 [")
+
+
+def test_command(tmp_path: Path, model_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("poselib")
+    write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
+    assert main([str(tmp_path / "hall.npz"), "--model", str(model_file), "--seeds", "0", "1"]) == 0
+    assert capsys.readouterr().out.count("\n| ") == len(VARIANTS) + 1
+    assert main([str(tmp_path / "missing.npz")]) == 2
+    assert "missing.npz" in capsys.readouterr().err
