@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..data.image_features import View, describe, match_views
 from ..data.scene_bundle import SceneBundle, ScenePair
-from ..data.source import Image, check_folder, read_image
+from ..data.source import Image, check_folder, match_views, read_image
+from ..features import describe
 from ..training.worlds.photographs import PhotoFolder
 from ..training.worlds.view_pairs import match_views as match_rendered
 from ..training.worlds.views import draw_views
@@ -41,10 +41,15 @@ class ImageSet:
 
     def matched(self, detector: cv2.Feature2D) -> list[ScenePair]:
         """All pairs with what a detector finds and nearest neighbours make of it, no test applied."""
-        views = {name: _view(name, image, self.intrinsics[name], detector) for name, image in self.images.items()}
+        views = {
+            name: replace(describe(image, detector, name), K=self.intrinsics[name])
+            for name, image in self.images.items()
+        }
         return [
-            match_views(self.name, index, views[pair.image1], views[pair.image2], pair.R, pair.t)
-            for index, pair in enumerate(self.pairs)
+            match_views(
+                self.name, i, (pair.image1, pair.image2), (views[pair.image1], views[pair.image2]), pair.R, pair.t
+            )
+            for i, pair in enumerate(self.pairs)
         ]
 
 
@@ -89,11 +94,6 @@ def rendered(photos: Path, count: int, seed: int) -> ImageSet:
 
 def _cameras(pair: ScenePair) -> Sequence[tuple[str, Array, tuple[int, int]]]:
     return ((pair.image1, pair.K1, pair.image_size1), (pair.image2, pair.K2, pair.image_size2))
-
-
-def _view(name: str, image: Image, K: Array, detector: cv2.Feature2D) -> View:
-    features = describe(image, detector, name)
-    return View(name, features, features.points, K)
 
 
 def _rescaled(K: Array, size: tuple[int, int], now: tuple[int, ...]) -> Array:

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
-from ..data.image_features import FEATURE_SETTINGS, detect, match_features
-from ..data.source import digest_files
+from ..data.source import detect, digest_files
+from ..features import FEATURE_SETTINGS, match_features
 from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
 
@@ -75,7 +75,7 @@ def _matched_arrays(path1: Path, path2: Path) -> dict[str, NDArray[Any]]:
     return {
         "points1": one.points[matches.index1],
         "points2": two.points[matches.index2],
-        "image1": np.array(one.size),
-        "image2": np.array(two.size),
+        "image1": np.array(one.image_size),
+        "image2": np.array(two.image_size),
         **{name: values for name, values in asdict(matches.attributes).items() if values is not None},
     }

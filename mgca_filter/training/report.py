@@ -20,9 +20,8 @@ from tqdm import tqdm
 from ..data.scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from ..errors import BundleError, MgcaFilterError
 from ..network import MGCANet, load_network
-from .input_kinds import INPUT_KINDS
 from .sampling import SamplingConfig
-from .validation import PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
+from .validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
 
 THRESHOLDS = np.arange(-4.0, 4.01, 0.5)
 Summary = dict[str, dict[str, dict[str, Any]]]  # scenes → kind of input → figures by name

@@ -16,8 +16,7 @@ from .augmentation import (
     transform_epipolar,
     transform_points,
 )
-from .labels import POSITIVE
-from .pairs import TrainingPair
+from .pairs import POSITIVE, TrainingPair
 from .sampling import Regime, SamplingConfig, draw_input
 from .sources import DataSource
 

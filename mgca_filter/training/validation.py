@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ..data import PairSource
 from ..data.scene_bundle import SceneBundle, ScenePair
 from ..evaluation.metrics import (
     FAILURE_DEG,
@@ -23,20 +23,47 @@ from ..fit.robust_fit import estimate_pose, pose_from_essential
 from ..geometry.cameras import mean_focal_length
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..inference.calibration import sigmoid
-from ..inputs.attributes import candidate_mask
+from ..inputs.attributes import MatchAttributes, candidate_mask
 from ..network import MGCANet
-from .input_kinds import InputList, raw
-from .sources.bundles import is_held_out
+from .sources import is_held_out
+
+InputList = tuple[NDArray[np.intp], MatchAttributes]
+"""The list that a caller arrives with: rows (M,) of a pair's matches, and what is still known of them."""
+RATIO_TEST = 0.75
 
 
-class PairSequence(Protocol):
-    """Pairs by number, such as a :class:`SceneBundle` has them."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int, /) -> ScenePair: ...
+def raw(pair: ScenePair) -> InputList:
+    """``knnMatch`` output: every match, with all that is known of it."""
+    return np.arange(len(pair.mutual)), pair.attributes
 
 
-def select_pairs(bundles: Sequence[PairSequence], per_scene: int) -> list[ScenePair]:
+def ratio_tested(pair: ScenePair) -> InputList:
+    """The usual loop over ``knnMatch`` with 0.75: what it leaves is a flat list, and the ratio is gone."""
+    assert pair.attributes.ratio is not None
+    rows = np.flatnonzero(pair.attributes.ratio < RATIO_TEST)
+    return rows, replace(pair.attributes.take(rows), ratio=None)
+
+
+def cross_checked(pair: ScenePair) -> InputList:
+    """``BFMatcher(crossCheck=True)``: two-way nearest neighbours without ratios."""
+    rows = np.flatnonzero(pair.mutual)
+    return rows, replace(pair.attributes.take(rows), ratio=None)
+
+
+def bare_points(pair: ScenePair) -> InputList:
+    """Two arrays of points and nothing else."""
+    return np.arange(len(pair.mutual)), MatchAttributes()
+
+
+INPUT_KINDS: dict[str, Callable[[ScenePair], InputList]] = {
+    "raw": raw,
+    "ratio 0.75": ratio_tested,
+    "cross-check": cross_checked,
+    "bare points": bare_points,
+}
+
+
+def select_pairs(bundles: Sequence[SceneBundle | PairSource], per_scene: int) -> list[ScenePair]:
     """At most ``per_scene`` pairs of each scene, evenly spaced."""
     chosen = []
     for bundle in bundles:

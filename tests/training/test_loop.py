@@ -31,7 +31,7 @@ from mgca_filter.training.loop import CHECKPOINT, DivergedError, Trainer
 from mgca_filter.training.run_directory import LOG, VALIDATION
 from mgca_filter.training.sampling import SamplingConfig
 from mgca_filter.training.schedule import LossWatch, learning_rate
-from mgca_filter.training.sources.bundles import BundleSource
+from mgca_filter.training.sources import BundleSource
 from mgca_filter.training.validation import quick_validation, select_pairs
 
 STEPS = 6

@@ -13,9 +13,8 @@ from scene_bundles import bundle_fields, write_bundle
 
 from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.network import save_network
-from mgca_filter.training.input_kinds import INPUT_KINDS
 from mgca_filter.training.report import THRESHOLDS, main, threshold_study
-from mgca_filter.training.validation import PairFigures, evaluate_pair, held_out_pairs, summarize
+from mgca_filter.training.validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, summarize
 
 
 @pytest.fixture(scope="module")

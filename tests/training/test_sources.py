@@ -12,18 +12,13 @@ from conftest import make_scene
 from photographs import write_photographs
 from scene_bundles import bundle_fields, write_bundle
 
-from mgca_filter.data.bundle_writer import LABEL_FIELD
-from mgca_filter.data.scene_bundle import SceneBundle
+from mgca_filter.data.scene_bundle import LABEL_FIELD, SceneBundle
 from mgca_filter.errors import BundleError, DatasetError
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.training.config import ConfigError, SourceConfig, TrainingConfig
-from mgca_filter.training.labels import IGNORED, NEGATIVE, POSITIVE, clean_labels
-from mgca_filter.training.match_statistics import MatchStatistics, main, measure
-from mgca_filter.training.pairs import TrainingPair
-from mgca_filter.training.sources import DataSource, MixedSource, open_sources
-from mgca_filter.training.sources.bundles import BundleSource, check_pairs
-from mgca_filter.training.sources.oanet import OanetSource
-from mgca_filter.training.sources.synthetic import SyntheticSource
+from mgca_filter.training.pairs import IGNORED, NEGATIVE, POSITIVE, TrainingPair, clean_labels
+from mgca_filter.training.sources import BundleSource, DataSource, MixedSource, OanetSource, open_sources
+from mgca_filter.training.synthetic import MatchStatistics, SyntheticSource, main, measure
 from mgca_filter.training.worlds.photographs import PhotoError
 
 KINDS = ("bundles", "oanet", "rendered", "synthetic", "mixed")
@@ -147,7 +142,7 @@ def test_pairs_without_geometry_are_refused(tmp_path, field, message):
         changes["covisible"][1] = 0
     bundle = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes, **changes))
     with pytest.raises(BundleError, match=rf"hall\.npz: {message}"):
-        check_pairs(bundle)
+        bundle.check_training_pairs()
 
 
 def test_scenes_choose_among_all_bundle_sources(data):

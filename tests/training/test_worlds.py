@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from photographs import write_photographs
 
-from mgca_filter.data.bundle_writer import LABEL_FIELD
-from mgca_filter.data.scene_bundle import SceneBundle
+from mgca_filter.data.scene_bundle import LABEL_FIELD, SceneBundle
 from mgca_filter.geometry.epipolar import essential_from_pose, symmetric_epipolar_distance_squared
-from mgca_filter.training.labels import NEGATIVE, POSITIVE
+from mgca_filter.training.pairs import NEGATIVE, POSITIVE
 from mgca_filter.training.render import main
 from mgca_filter.training.worlds.cameras import Camera
 from mgca_filter.training.worlds.imaging import add_passers_by
@@ -135,7 +134,10 @@ def test_labels_agree_with_the_pose(pair):
     assert pair.usable
     assert distance[right].max() < 1.5e-5
     assert ((pair.labels == NEGATIVE) & (distance < 1e-5)).any()  # accidents near the line are told by depth
-    assert pair.matches.ratio[right].mean() < pair.matches.ratio[pair.labels == NEGATIVE].mean() - 0.1
+    assert (
+        pair.matches.attributes.ratio[right].mean()
+        < pair.matches.attributes.ratio[pair.labels == NEGATIVE].mean() - 0.1
+    )
 
 
 def test_passers_by_hide_what_is_behind_them(photos):
