@@ -9,20 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from .fit.estimators import METHODS
 from .fit.ranking import RankedMatches, match_order
 from .fit.robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
 from .fit.verdict import Verdict, count_distinct, judge
 from .inference import BACKENDS, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_network_input
-from .inputs.attributes import MatchAttributes
-from .inputs.options import check_choice, check_integer, check_number, check_path, check_providers
+from .inputs.attributes import Column, MatchAttributes
+from .inputs.options import FilterOptions, check_choice, check_path, check_providers, method_name
 from .inputs.pair import MatchPair, PairInput, prepare_pair
 from .result import FilterResult, Status
-from .types import Providers
+from .types import MatchesLike, MatrixLike, PointsLike, Providers, SizeLike
 
 _BATCH_PAIRS = 8
 
@@ -38,7 +37,8 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold, keep_precision, confidence, method, model, providers, backend, seed: as in :func:`filter_matches`.
+        threshold, keep_precision, confidence, method, max_iterations, model, providers, backend, seed: as in
+            :func:`filter_matches`.
 
     Raises:
         TypeError, ValueError: an option is not one of the above.
@@ -50,46 +50,41 @@ class MatchFilter:
     def __init__(
         self,
         *,
-        threshold: float = 1.0,
-        keep_precision: float | None = None,
-        confidence: float = 0.999,
-        method: str = "prosac",
+        threshold: float = FilterOptions.threshold,
+        keep_precision: float | None = FilterOptions.keep_precision,
+        confidence: float = FilterOptions.confidence,
+        method: str | int = FilterOptions.method,
+        max_iterations: int = FilterOptions.max_iterations,
         model: str | Path | None = None,
         providers: Providers | None = None,
         backend: str = "auto",
-        seed: int = 0,
+        seed: int = FilterOptions.seed,
     ) -> None:
-        check_choice(method, METHODS, "method")
         check_choice(backend, BACKENDS, "backend")
-        self.threshold = check_number(threshold, "threshold", 0.0, float("inf"))
-        self.keep_precision = (
-            None if keep_precision is None else check_number(keep_precision, "keep_precision", 0.0, 1.0)
-        )
-        self.method = method
-        self.fit_options = RobustFitOptions(
-            method=method,
-            confidence=check_number(confidence, "confidence", 0.0, 1.0),
-            seed=check_integer(seed, "seed", 0),
-        )
+        self.options = FilterOptions(threshold, keep_precision, confidence, method_name(method), max_iterations, seed)
+        self.fit_options = RobustFitOptions.of(self.options)
         self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
 
     def filter(
         self,
-        kp1: Any,
-        kp2: Any,
-        matches: Any,
+        kp1: PointsLike,
+        kp2: PointsLike,
+        matches: MatchesLike | None,
         *,
-        K1: Any = None,
-        K2: Any = None,
-        dist1: Any = None,
-        dist2: Any = None,
-        size1: Any = None,
-        size2: Any = None,
+        K1: MatrixLike | None = None,
+        K2: MatrixLike | None = None,
+        dist1: ArrayLike | None = None,
+        dist2: ArrayLike | None = None,
+        size1: SizeLike | None = None,
+        size2: SizeLike | None = None,
         attributes: MatchAttributes | None = None,
+        K: MatrixLike | None = None,
     ) -> FilterResult:
         """Filter the matches of one pair; arguments, result and errors as in :func:`filter_matches`."""
+        K1 = _shared_intrinsics(K, K1, K2)
         return self.filter_many([MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)])[0]
 
+    @np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
     def filter_many(self, pairs: Iterable[MatchPair | tuple[Any, Any, Any]]) -> list[FilterResult]:
         """Filter many pairs; those that send equally many matches go through the network in one batch.
 
@@ -120,7 +115,7 @@ class MatchFilter:
             raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
         prepared = prepare_pair(pair)
         sent = select_network_input(
-            prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.fit_options.seed
+            prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.options.seed
         )
         return _Job(prepared, sent, timings_ms={"prepare": _milliseconds_since(started)})
 
@@ -140,15 +135,15 @@ class MatchFilter:
         scores = np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
         model = None
         started = time.perf_counter()
-        if self.method == "none":
+        if self.options.method == "none":
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             ranked = self._rank(pair, job.sent, logits, scores)
             model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, job.network_essential)
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
-            verdict = judge(pair, model, ranked, self.threshold, self.fit_options)
-            if self.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
+            verdict = judge(pair, model, ranked, self.options.threshold, self.fit_options)
+            if self.options.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
         return FilterResult(
@@ -161,6 +156,9 @@ class MatchFilter:
             t=verdict.t,
             status=verdict.status,
             num_inliers=int(np.count_nonzero(verdict.mask)),
+            points1=pair.points1,
+            points2=pair.points2,
+            indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
             info={
                 **self._describe(job),
                 "logits": logits,
@@ -176,15 +174,19 @@ class MatchFilter:
         """What the network saw, in the order in which the robust fit draws."""
         margins = logits - self._backend.metadata.decision_threshold
         rows = sent.rows
-        order = rows[match_order(margins[rows], pair.attributes[rows, 0], pair.attributes[rows, 5] > 0)]
+        order = rows[
+            match_order(
+                margins[rows], pair.attributes[rows, Column.RATIO], pair.attributes[rows, Column.RATIO_KNOWN] > 0
+            )
+        ]
         return RankedMatches.of(pair.correspondences, order, scores, margins)
 
     def _keep_by_scores(self, pair: PairInput, scores: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Mask (M,) that asks the network alone."""
-        if self.keep_precision is None:
+        if self.options.keep_precision is None:
             return (scores > 0.5) & pair.valid
         kept = np.zeros(len(scores), dtype=bool)
-        kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.keep_precision)
+        kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.options.keep_precision)
         return kept
 
     def _describe(self, job: _Job) -> dict[str, Any]:
@@ -218,35 +220,38 @@ class _Job:
 
 
 def filter_matches(
-    kp1: Any,
-    kp2: Any,
-    matches: Any,
+    kp1: PointsLike,
+    kp2: PointsLike,
+    matches: MatchesLike | None,
     *,
-    K1: Any = None,
-    K2: Any = None,
-    dist1: Any = None,
-    dist2: Any = None,
-    size1: Any = None,
-    size2: Any = None,
-    threshold: float = 1.0,
-    keep_precision: float | None = None,
-    confidence: float = 0.999,
-    method: str = "prosac",
+    K1: MatrixLike | None = None,
+    K2: MatrixLike | None = None,
+    dist1: ArrayLike | None = None,
+    dist2: ArrayLike | None = None,
+    size1: SizeLike | None = None,
+    size2: SizeLike | None = None,
+    threshold: float = FilterOptions.threshold,
+    keep_precision: float | None = FilterOptions.keep_precision,
+    confidence: float = FilterOptions.confidence,
+    method: str | int = FilterOptions.method,
+    max_iterations: int = FilterOptions.max_iterations,
     attributes: MatchAttributes | None = None,
+    K: MatrixLike | None = None,
     model: str | Path | None = None,
     providers: Providers | None = None,
     backend: str = "auto",
-    seed: int = 0,
+    seed: int = FilterOptions.seed,
 ) -> FilterResult:
     """Tell right matches from wrong ones and estimate the two-view geometry.
 
     Pixels follow OpenCV (the centre of the top-left pixel is (0, 0)); ``x2^T E x1 = 0``, ``X2 = R X1 + t``.
 
     Args:
-        kp1, kp2: sequences of ``cv2.KeyPoint``, or arrays (N, 2) or (N, 1, 2) of pixels.
-        matches: sequence of ``cv2.DMatch``; ``knnMatch`` output, whose second candidates give the ratio; an
-            integer array (M, 2); or None = row i matches row i. What matches and keypoints know beyond
-            position (ratio, best of the list, size, angle) is used and never required.
+        kp1, kp2: ``cv2.KeyPoint`` objects in any container that keeps an order, or arrays (N, 2), (N, 1, 2) or
+            (1, N, 2) of pixels.
+        matches: ``cv2.DMatch`` objects; ``knnMatch`` output, whose second candidates give the ratio; an integer
+            array (M, 2); or None = row i matches row i. What matches and keypoints know beyond position (ratio,
+            best of the list, size, angle) is used and never required.
         K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal length is
             guessed and F is the model to trust.
         dist1, dist2: OpenCV distortion coefficients; E and F then hold for undistorted points.
@@ -256,9 +261,12 @@ def filter_matches(
             their scores, is at least this (above 0, below 1), whatever their distance to the model. All False where
             there is no model, as ever.
         confidence: of the robust fit, between 0 and 1.
-        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"``, ``"poselib"`` (needs that package) or
-            ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
+        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"`` (or ``cv2.USAC_PROSAC``, ``cv2.USAC_MAGSAC``,
+            ``cv2.RANSAC``), ``"poselib"`` (needs that package), or ``"none"``, which returns scores and a mask of
+            scores above 0.5 (or by ``keep_precision``), no geometry.
+        max_iterations: largest number of samples that one run of a robust estimator draws.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
+        K: another way to say that both images share ``K1``.
         model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
         backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
@@ -274,11 +282,13 @@ def filter_matches(
         BackendError: no runtime can be started, or it refused.
         ImportError: ``method="poselib"`` without PoseLib.
     """
+    K1 = _shared_intrinsics(K, K1, K2)
     match_filter = MatchFilter(
         threshold=threshold,
         keep_precision=keep_precision,
         confidence=confidence,
         method=method,
+        max_iterations=max_iterations,
         model=model,
         providers=providers,
         backend=backend,
@@ -291,6 +301,15 @@ def filter_matches(
 def filter_many(pairs: Iterable[MatchPair | tuple[Any, Any, Any]], **options: Any) -> list[FilterResult]:
     """Filter many pairs with the options of :class:`MatchFilter`; see :meth:`MatchFilter.filter_many`."""
     return MatchFilter(**options).filter_many(pairs)
+
+
+def _shared_intrinsics(K: MatrixLike | None, K1: MatrixLike | None, K2: MatrixLike | None) -> MatrixLike | None:
+    """``K1``, or ``K`` in its place."""
+    if K is None:
+        return K1
+    if K1 is not None or K2 is not None:
+        raise ValueError("K: both images share it, so that K1 and K2 cannot be given as well")
+    return K
 
 
 def _verdict_by_scores(pair: PairInput, kept: NDArray[np.bool_]) -> Verdict:

@@ -30,6 +30,11 @@ class ImageMatchResult:
     matches: tuple[tuple[cv2.DMatch, ...], ...]
     result: FilterResult
 
+    def __repr__(self) -> str:
+        """The counts and the filter's verdict; the keypoints would fill the screen."""
+        counts = f"{len(self.keypoints1)} and {len(self.keypoints2)} keypoints, {len(self.matches)} matches"
+        return f"ImageMatchResult({counts}, {self.result!r})"
+
 
 def match_images(
     image1: NDArray[Any],

@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .drawing import MatchPanel, draw_matches
 
-class Status(enum.Enum):
-    """Verdict on a pair of images; only ``OK`` and ``PLANAR`` come with a pose that can be used as it is."""
+
+class Status(str, enum.Enum):
+    """Verdict on a pair of images; only ``OK`` and ``PLANAR`` come with a pose that can be used as it is.
+
+    A status is its word: ``status == "ok"``, ``print(status)`` and ``json.dumps(status)`` all see ``"ok"``.
+    """
 
     OK = "ok"
     TOO_FEW_MATCHES = "too_few_matches"
@@ -22,6 +28,12 @@ class Status(enum.Enum):
     PLANAR = "planar"
     PURE_ROTATION = "pure_rotation"
     SUSPICIOUS_INTRINSICS = "suspicious_intrinsics"
+
+    def __str__(self) -> str:
+        return self.value
+
+    def __format__(self, spec: str) -> str:
+        return format(self.value, spec)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +52,8 @@ class FilterResult:
         R, t: (3, 3) rotation and (3,) unit translation, or None.
         status: the verdict.
         num_inliers: number of True in ``mask``.
+        points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
+        indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches``,
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
@@ -58,7 +72,60 @@ class FilterResult:
     t: NDArray[np.float64] | None
     status: Status
     num_inliers: int
+    points1: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    points2: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    indices: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
     info: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """The geometry may be used as it is: ``status`` is ``OK`` or ``PLANAR``."""
+        return self.status in (Status.OK, Status.PLANAR)
+
+    def __bool__(self) -> bool:
+        """As :attr:`ok`."""
+        return self.ok
+
+    @property
+    def dmatches(self) -> list[cv2.DMatch]:
+        """The kept matches as plain ``cv2.DMatch``, whatever came in: what ``cv2.drawMatches`` takes.
+
+        The distance is the caller's, of a ``knnMatch`` row that of its first candidate; 0 where indices came in.
+        """
+        kept: list[cv2.DMatch] = []
+        for row, (query, train) in zip(self.matches, self.indices[self.mask]):
+            match = row if isinstance(row, cv2.DMatch) else row[0]
+            kept.append(match if isinstance(match, cv2.DMatch) else cv2.DMatch(int(query), int(train), 0.0))
+        return kept
+
+    def relative_pose(self, baseline: float = 1.0) -> NDArray[np.float64] | None:
+        """The pose of camera 2 relative to camera 1 as one matrix (4, 4): ``X2 = T X1`` in homogeneous coordinates.
+
+        Args:
+            baseline: distance between the camera centres, in the unit that the matrix shall have; two views do not
+                tell it, so that it is 1 unless the caller knows better.
+
+        Returns:
+            The matrix, float64, or None where the pair has no rotation or no direction of translation.
+        """
+        if self.R is None or self.t is None:
+            return None
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = self.R, baseline * self.t
+        return T
+
+    def draw(self, image1: NDArray[np.uint8], image2: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Picture (H, W, 3) uint8 BGR of kept and rejected matches, side by side.
+
+        Args:
+            image1, image2: the images whose pixels the keypoints are in, (h, w), (h, w, 3) BGR or (h, w, 4) BGRA uint8.
+
+        Raises:
+            ValueError: an image is empty or no uint8 image.
+        """
+        facts = (f"{len(self.mask)} matches", f"{self.num_inliers} kept")
+        panel = MatchPanel(self.mask, self.status.value, facts, self.ok)
+        return draw_matches(image1, image2, self.points1, self.points2, panel)
 
     def __repr__(self) -> str:
         """The verdict and the counts; the arrays would fill the screen."""

@@ -27,9 +27,10 @@ FLOORS = (
     ("fit",),
     ("features",),
     ("inputs",),
+    ("result",),
     ("network", "drawing", "images", "image_header"),
     ("geometry",),
-    ("result", "types", "atomic_file"),
+    ("types", "atomic_file"),
     ("errors",),
 )
 HEIGHT = {room: -index for index, floor in enumerate(FLOORS) for room in floor}

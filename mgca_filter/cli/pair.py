@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
-from ..fit.estimators import METHODS
 from ..images import decode_image
+from ..inputs.options import METHODS
 from ..match_images import match_images
 from .arguments import (
     EXIT_FOUND,

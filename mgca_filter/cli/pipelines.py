@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
-from ..fit.estimators import METHODS
+from ..inputs.options import METHODS
 from ..pipelines.run import EngineOptions, Summary
 from .arguments import (
     EXIT_FOUND,

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -93,7 +94,7 @@ def judge_trial(trial: Trial, intrinsics: str, match_filter: MatchFilter) -> Jud
     )
 
 
-def _plausible_camera(size: Sequence[int]) -> NDArray[np.float64]:
+def _plausible_camera(size: Any) -> NDArray[np.float64]:
     focal = PLAUSIBLE_FOCAL_FACTOR * max(size)
     return np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
 

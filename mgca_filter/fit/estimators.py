@@ -24,11 +24,11 @@ _CONFIDENCE, _MAX_ITERATIONS = 0.999, 1000
 
 Array = NDArray[np.float64]
 
-METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
 # Behind the network hardly a sample is spoiled: PoseLib's own 1000 buy nothing but time.
 _POSELIB_MIN_ITERATIONS = 50
 # Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
+_find_homography = cv2.findHomography
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def fit_homography(points1: Array, points2: Array, threshold: float, seed: int =
     scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
     params = usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, 1.0, _CONFIDENCE, _MAX_ITERATIONS, seed)
     try:
-        H, _ = cv2.findHomography(points1 / threshold, points2 / threshold, params)
+        H, _ = _find_homography(points1 / threshold, points2 / threshold, params)
     except cv2.error:
         return None
     if H is None or np.shape(H) != (3, 3) or not np.isfinite(H).all():

@@ -26,6 +26,7 @@ from ..geometry.epipolar import (
 )
 from ..geometry.homography import poses_from_homography
 from ..geometry.pose_refinement import refine_pose
+from ..inputs.options import FilterOptions
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
 from .ranking import RankedMatches
 
@@ -75,14 +76,24 @@ class RobustFitOptions:
         refine_threshold_px: where refinement and support cut the error off, pixels.
     """
 
-    method: str = "prosac"
+    method: str = FilterOptions.method
     threshold_px: float = 0.5
-    confidence: float = 0.9999
-    max_iterations: int = 5000
-    seed: int = 0
+    confidence: float = FilterOptions.confidence
+    max_iterations: int = FilterOptions.max_iterations
+    seed: int = FilterOptions.seed
     starts: tuple[Start, ...] | None = None
     refine: bool = True
     refine_threshold_px: float = 1.0
+
+    @classmethod
+    def of(cls, options: FilterOptions) -> RobustFitOptions:
+        """What the filter's options ask of the fit."""
+        return cls(
+            method=options.method,
+            confidence=options.confidence,
+            max_iterations=options.max_iterations,
+            seed=options.seed,
+        )
 
     @property
     def runs(self) -> tuple[Start, ...]:

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-ATTRIBUTE_COUNT = 8
+
+class Column(IntEnum):
+    """Columns of the encoded attributes (M, 8), the network's second input."""
+
+    RATIO = 0
+    BEST = 1
+    LOG2_SIZE = 2
+    COS_TURN = 3
+    SIN_TURN = 4
+    RATIO_KNOWN = 5
+    BEST_KNOWN = 6
+    SHAPE_KNOWN = 7
+
+
+ATTRIBUTE_COUNT = len(Column)
 CANDIDATE_MAX_RATIO = 0.95
 CANDIDATE_MIN_COUNT = 32
 
@@ -34,17 +49,17 @@ class MatchAttributes:
     def encode(self, count: int) -> NDArray[np.float32]:
         """Network input (count, 8), raw physical values; groups that are unknown are zero.
 
-        Columns: ratio, best (0/1), log2(size2 / size1), cos and sin of angle2 − angle1, and three flags
-        (0/1) — ratio known, best known, size and angle known.
+        :class:`Column` names the columns: ratio, best (0/1), log2(size2 / size1), cos and sin of angle2 − angle1,
+        and three flags (0/1) — ratio known, best known, size and angle known.
         """
         encoded = np.zeros((count, ATTRIBUTE_COUNT), dtype=np.float32)
         if self.ratio is not None:
             known = np.isfinite(self.ratio)
-            encoded[:, 0] = np.clip(np.where(known, self.ratio, 0.0), 0.0, 1.0)
-            encoded[:, 5] = known
+            encoded[:, Column.RATIO] = np.clip(np.where(known, self.ratio, 0.0), 0.0, 1.0)
+            encoded[:, Column.RATIO_KNOWN] = known
         if self.best is not None:
-            encoded[:, 1] = self.best
-            encoded[:, 6] = 1.0
+            encoded[:, Column.BEST] = self.best
+            encoded[:, Column.BEST_KNOWN] = 1.0
         fields = (self.size1, self.size2, self.angle1, self.angle2)
         if all(field is not None for field in fields):
             size1, size2, angle1, angle2 = (np.asarray(field, dtype=np.float64) for field in fields)
@@ -52,10 +67,10 @@ class MatchAttributes:
                 known = (size1 > 0) & (size2 > 0) & (angle1 >= 0) & (angle2 >= 0)
                 known &= np.isfinite(size1) & np.isfinite(size2) & np.isfinite(angle1) & np.isfinite(angle2)
             turn = np.radians(np.where(known, angle2, 0.0) - np.where(known, angle1, 0.0))
-            encoded[:, 2] = np.log2(np.where(known, size2, 1.0) / np.where(known, size1, 1.0))
-            encoded[:, 3] = np.where(known, np.cos(turn), 0.0)
-            encoded[:, 4] = np.where(known, np.sin(turn), 0.0)
-            encoded[:, 7] = known
+            encoded[:, Column.LOG2_SIZE] = np.log2(np.where(known, size2, 1.0) / np.where(known, size1, 1.0))
+            encoded[:, Column.COS_TURN] = np.where(known, np.cos(turn), 0.0)
+            encoded[:, Column.SIN_TURN] = np.where(known, np.sin(turn), 0.0)
+            encoded[:, Column.SHAPE_KNOWN] = known
         return encoded
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MatchAttributes:
@@ -75,8 +90,8 @@ def candidate_mask(
     A match is a candidate when it is best of the list and its ratio is below ``max_ratio``; a match whose ratio
     or best-of-list flag is unknown is one too. All are, when fewer than ``min_count`` would remain.
     """
-    ratio, best = attributes[:, 0], attributes[:, 1]
-    ratio_known, best_known = attributes[:, 5] > 0, attributes[:, 6] > 0
+    ratio, best = attributes[:, Column.RATIO], attributes[:, Column.BEST]
+    ratio_known, best_known = attributes[:, Column.RATIO_KNOWN] > 0, attributes[:, Column.BEST_KNOWN] > 0
     hopeless: NDArray[np.bool_] = ratio_known & best_known & ((ratio >= max_ratio) | (best == 0))
     if len(hopeless) - np.count_nonzero(hopeless) < min_count:
         return np.ones(len(attributes), dtype=bool)

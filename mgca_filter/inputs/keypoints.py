@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .containers import unpacked
+
 
 @dataclass(frozen=True)
 class Keypoints:
@@ -34,10 +36,11 @@ class Keypoints:
 
 
 def read_keypoints(keypoints: Any, name: str = "keypoints") -> Keypoints:
-    """Read a sequence of ``cv2.KeyPoint`` or an array (N, 2) or (N, 1, 2) of pixels.
+    """Read keypoints: ``cv2.KeyPoint`` objects, or an array (N, 2), (N, 1, 2) or (1, N, 2) of pixels.
 
     Args:
-        keypoints: what the caller holds; an empty sequence gives no keypoints.
+        keypoints: what the caller holds, in any container that keeps an order (list, tuple, object array, generator,
+            ``cv2.UMat``); an empty one gives no keypoints.
         name: name of the argument, for messages.
 
     Raises:
@@ -48,7 +51,10 @@ def read_keypoints(keypoints: Any, name: str = "keypoints") -> Keypoints:
         raise TypeError(
             f"{name}: expected a sequence of cv2.KeyPoint or an array (N, 2), got {type(keypoints).__name__}"
         )
+    keypoints = unpacked(keypoints)
     if isinstance(keypoints, Sequence):
+        if all(isinstance(item, list) and len(item) == 1 for item in keypoints):  # a column of an object array
+            keypoints = [item[0] for item in keypoints]
         if any(isinstance(item, cv2.KeyPoint) for item in keypoints):
             return _from_cv2(keypoints, name)
         if len(keypoints) == 0:
@@ -76,10 +82,10 @@ def _read_points(points: Any, name: str) -> NDArray[np.float64]:
         raise ValueError(f"{name}: expected an array (N, 2) of pixels ({error})") from error
     if array.dtype.kind not in "iuf":
         raise TypeError(f"{name}: expected cv2.KeyPoint or real numbers, got dtype {array.dtype}")
-    if array.size == 0 and array.shape in ((0,), (0, 2), (0, 1, 2)):
+    if array.size == 0 and array.shape in ((0,), (0, 2), (0, 1, 2), (1, 0, 2)):
         return np.zeros((0, 2))
-    if array.ndim == 3 and array.shape[1:] == (1, 2):
-        array = array[:, 0]
+    if array.ndim == 3 and array.shape[2] == 2 and 1 in array.shape[:2]:
+        array = array.reshape(-1, 2)
     if array.ndim != 2 or array.shape[1] != 2:
-        raise ValueError(f"{name}: expected shape (N, 2) or (N, 1, 2), got {array.shape}")
+        raise ValueError(f"{name}: expected shape (N, 2), (N, 1, 2) or (1, N, 2), got {array.shape}")
     return array.astype(np.float64)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .attributes import best_of_list, distance_ratio
+from .containers import unpacked
 
 # OpenCV's default of DMatch.distance is the largest float: "no distance was set".
 _NO_DISTANCE = 1e38
@@ -41,13 +42,13 @@ class PutativeMatches:
     def select(self, mask: NDArray[np.bool_]) -> Any:
         """The rows where ``mask`` (M,) is True, in the caller's type.
 
-        A tuple stays a tuple, any other sequence becomes a list, an array stays an array of its dtype, and
-        ``None`` (row i matches row i) becomes index pairs (K, 2).
+        A tuple stays a tuple, any other sequence or iterator becomes a list, an array stays an array of its dtype,
+        and ``None`` (row i matches row i) becomes index pairs (K, 2).
         """
         if self.source is None:
             return np.stack([self.index1[mask], self.index2[mask]], axis=1)
         if isinstance(self.source, np.ndarray):
-            return self.source.reshape(-1, 2)[mask]
+            return self.source[mask] if self.source.dtype == object else self.source.reshape(-1, 2)[mask]
         kept = [self.source[i] for i in np.flatnonzero(mask)]
         return tuple(kept) if isinstance(self.source, tuple) else kept
 
@@ -56,8 +57,9 @@ def read_matches(matches: Any, count1: int, count2: int, name: str = "matches") 
     """Read matches between ``count1`` and ``count2`` keypoints.
 
     Args:
-        matches: sequence of ``cv2.DMatch``; ``knnMatch`` output (a sequence of sequences: the first candidate
-            is the match, the second gives the ratio); an integer array (M, 2); or None = row i matches row i.
+        matches: ``cv2.DMatch`` objects; ``knnMatch`` output (rows of candidates: the first is the match, the second
+            gives the ratio), both in any container that keeps an order; an integer array (M, 2); or None = row i
+            matches row i.
         name: name of the argument, for messages.
 
     Raises:
@@ -75,15 +77,17 @@ def read_matches(matches: Any, count1: int, count2: int, name: str = "matches") 
         raise TypeError(
             f"{name}: expected DMatch, knnMatch output, an array (M, 2) or None, got {type(matches).__name__}"
         )
-    if not isinstance(matches, np.ndarray) and isinstance(matches, Sequence):
-        if len(matches) == 0:
+    listed = unpacked(matches)
+    if not isinstance(listed, np.ndarray) and isinstance(listed, Sequence):
+        source = matches if isinstance(matches, (Sequence, np.ndarray)) else listed
+        if len(listed) == 0:
             none = np.zeros(0, dtype=np.intp)
-            return PutativeMatches(none, none, None, None, matches)
-        if isinstance(matches[0], cv2.DMatch):
-            return _from_dmatch(matches, [(m,) for m in matches], count1, count2, name)
-        if any(_is_knn_row(row) for row in matches):
-            return _from_dmatch(matches, matches, count1, count2, name)
-    return _from_array(matches, count1, count2, name)
+            return PutativeMatches(none, none, None, None, source)
+        if isinstance(listed[0], cv2.DMatch):
+            return _from_dmatch(source, [(m,) for m in listed], count1, count2, name)
+        if any(_is_knn_row(row) for row in listed):
+            return _from_dmatch(source, listed, count1, count2, name)
+    return _from_array(listed, count1, count2, name)
 
 
 def _is_knn_row(row: Any) -> bool:

@@ -1,13 +1,68 @@
-"""Checks of the filter's scalar options: TypeError for another type, ValueError for another value, both by name."""
+"""Options of the filter, checked once: TypeError for another type, ValueError for another value, both by name."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from ..types import Providers
+
+METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
+# OpenCV's flags of the estimators that have the same names here.
+_FLAGS = {cv2.USAC_MAGSAC: "magsac", cv2.USAC_PROSAC: "prosac", cv2.RANSAC: "ransac"}
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """What the filter is asked to do with a pair, whatever runtime scores it.
+
+    Attributes:
+        threshold: inlier threshold of the mask, pixels (Sampson distance).
+        keep_precision: expected precision of the mask that takes the threshold's place, or None.
+        confidence: of the robust fit, between 0 and 1.
+        method: one of :data:`METHODS`.
+        max_iterations: largest number of samples that one run of a robust estimator draws.
+        seed: of every random choice.
+
+    Raises:
+        TypeError, ValueError: a value is of another type or range.
+    """
+
+    threshold: float = 1.0
+    keep_precision: float | None = None
+    confidence: float = 0.999
+    method: str = "prosac"
+    max_iterations: int = 5000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_number(self.threshold, "threshold", 0.0, float("inf"))
+        if self.keep_precision is not None:
+            check_number(self.keep_precision, "keep_precision", 0.0, 1.0)
+        check_number(self.confidence, "confidence", 0.0, 1.0)
+        check_choice(self.method, METHODS, "method")
+        check_integer(self.max_iterations, "max_iterations", 1)
+        check_integer(self.seed, "seed", 0)
+
+
+def method_name(method: str | int) -> str:
+    """The name of a robust fit, from itself or from OpenCV's flag.
+
+    Raises:
+        ValueError: a flag that means no method of the filter.
+    """
+    if isinstance(method, (int, np.integer)):
+        if int(method) not in _FLAGS:
+            raise ValueError(
+                f"method: OpenCV's flag {method} has no counterpart here, expected cv2.USAC_MAGSAC, cv2.USAC_PROSAC, "
+                f"cv2.RANSAC or one of {', '.join(METHODS)}"
+            )
+        return _FLAGS[int(method)]
+    return method
 
 
 def check_choice(value: Any, choices: tuple[str, ...], name: str) -> None:

@@ -6,9 +6,10 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ..geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
+from ..types import MatchesLike, MatrixLike, PointsLike, SizeLike
 from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
 from .matches import PutativeMatches, read_matches
@@ -21,15 +22,15 @@ _MAX_NORMALIZED = 1e3
 class MatchPair:
     """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`."""
 
-    kp1: Any
-    kp2: Any
-    matches: Any
-    K1: Any = None
-    K2: Any = None
-    dist1: Any = None
-    dist2: Any = None
-    size1: Any = None
-    size2: Any = None
+    kp1: PointsLike
+    kp2: PointsLike
+    matches: MatchesLike | None
+    K1: MatrixLike | None = None
+    K2: MatrixLike | None = None
+    dist1: ArrayLike | None = None
+    dist2: ArrayLike | None = None
+    size1: SizeLike | None = None
+    size2: SizeLike | None = None
     attributes: MatchAttributes | None = None
 
 
@@ -39,6 +40,7 @@ class PairInput:
 
     Attributes:
         matches: what the caller passed, read.
+        points1, points2: (M, 2) float64 pixels as they came in, NaN where a row holds no match.
         correspondences: (M, 4) float64, normalised; NaN where a row has no usable coordinates.
         valid: (M,) bool, rows with usable coordinates.
         attributes: (M, 8) float32, encoded.
@@ -46,6 +48,8 @@ class PairInput:
     """
 
     matches: PutativeMatches
+    points1: NDArray[np.float64]
+    points2: NDArray[np.float64]
     correspondences: NDArray[np.float64]
     valid: NDArray[np.bool_]
     attributes: NDArray[np.float32]
@@ -80,15 +84,24 @@ def prepare_pair(pair: MatchPair) -> PairInput:
     intrinsics1, intrinsics2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
     present = (putative.index1 >= 0)[:, None]
     if present.any():
-        x1 = np.where(present, intrinsics1.normalize(keypoints1.points)[putative.index1], np.nan)
-        x2 = np.where(present, intrinsics2.normalize(keypoints2.points)[putative.index2], np.nan)
+        ends = [
+            np.where(present, points[index], np.nan)
+            for points, index in (
+                (keypoints1.points, putative.index1),
+                (keypoints2.points, putative.index2),
+                (intrinsics1.normalize(keypoints1.points), putative.index1),
+                (intrinsics2.normalize(keypoints2.points), putative.index2),
+            )
+        ]
     else:
-        x1 = x2 = np.full((len(putative), 2), np.nan)
-    correspondences = np.hstack([x1, x2])
+        ends = [np.full((len(putative), 2), np.nan)] * 4
+    correspondences = np.hstack(ends[2:])
     with np.errstate(invalid="ignore"):
         valid = (np.abs(correspondences) < _MAX_NORMALIZED).all(axis=1)
     known = _merge_attributes(putative, keypoints1, keypoints2, pair.attributes)
-    return PairInput(putative, correspondences, valid, known.encode(len(putative)), intrinsics1, intrinsics2)
+    return PairInput(
+        putative, ends[0], ends[1], correspondences, valid, known.encode(len(putative)), intrinsics1, intrinsics2
+    )
 
 
 def _merge_attributes(

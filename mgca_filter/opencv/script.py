@@ -1,19 +1,24 @@
 """``python -m mgca_filter run script.py``: an unchanged OpenCV script with the filter in place, and what changed.
 
 Every call that the filter takes over is also made to OpenCV's own function, on the same arguments, for the table that
-is printed on standard error when the script ends. The script goes on with the filter's answer.
+is printed on standard error when the script ends. The script goes on with the filter's answer. Below the table stands
+what the filter did not see: calls of OpenCV's other estimators, and processes that the script started.
 """
 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
+import os
 import runpy
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import cv2
@@ -24,6 +29,8 @@ from ..match_filter import MatchFilter
 from .patch import TWINS, locate, swapped
 
 EXIT_USAGE = 2
+UNCOVERED = ("findHomography", "estimateAffine2D", "estimateAffinePartial2D", "recoverPose")
+"""OpenCV's other robust estimators between two images; ``recoverPose`` is one where it fits E itself."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +58,9 @@ class CallLog:
 
     def __init__(self) -> None:
         self._calls: list[Call] = []
+        self._uncovered: Counter[str] = Counter()
         self._lock = threading.Lock()
+        self._children_s = _children_seconds()
 
     def recording(self, name: str, original: Callable[..., Any], twin: Callable[..., Any]) -> Callable[..., Any]:
         """``twin`` as a function that also asks ``original`` and notes what both made of it."""
@@ -64,13 +73,30 @@ class CallLog:
             # The mask of an estimator has a row per match; GMS gets its matches as the fifth argument.
             of_gms = name.endswith("matchGMS")
             matches = kwargs.get("matches1to2", args[4] if len(args) > 4 else ()) if of_gms else answer[1]
-            caller = sys._getframe(1)
-            place = f"{Path(caller.f_code.co_filename).name}:{caller.f_lineno}"
             with self._lock:
-                self._calls.append(Call(place, name, len(matches), opencv, ours))
+                self._calls.append(Call(_place(sys._getframe(1)), name, len(matches), opencv, ours))
             return answer
 
         return call
+
+    def counting(self, name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        """``original``, one of :data:`UNCOVERED`, as a function that notes where it is called."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            given_a_matrix = name == "recoverPose" and args and np.shape(args[0]) == (3, 3)
+            if not given_a_matrix:
+                with self._lock:
+                    self._uncovered[f"{_place(sys._getframe(1))} {name}"] += 1
+            return original(*args, **kwargs)
+
+        return call
+
+    def unseen(self) -> list[str]:
+        """Sentences on what the table does not hold."""
+        lines = [f"not taken over: {where}, {count} calls" for where, count in self._uncovered.items()]
+        if _children_seconds() > self._children_s or multiprocessing.active_children():
+            lines.append("the script started other processes: their calls are not in this table")
+        return lines
 
     def table(self) -> str:
         """One row per place in the script: sums over its calls of matches, kept ones and milliseconds."""
@@ -88,7 +114,18 @@ class CallLog:
         widths = [max(len(row[i]) for row in rows) for i in range(len(header))]
         lines = ["  ".join(f"{word:>{w}}" if i else f"{word:<{w}}" for i, (word, w) in enumerate(zip(row, widths)))
                  for row in rows]  # fmt: skip
-        return "\n".join(lines) if places else "no call that the filter takes over was made"
+        return "\n".join([*(lines if places else ["no call that the filter takes over was made"]), *self.unseen()])
+
+
+def _place(frame: FrameType) -> str:
+    """File and line of a caller."""
+    return f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"
+
+
+def _children_seconds() -> float:
+    """Processor time of the child processes that have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _try_opencv(original: Callable[..., Any], args: Sequence[Any], kwargs: dict[str, Any]) -> Outcome:
@@ -106,7 +143,8 @@ def _outcome(answer: Any, started: float) -> Outcome:
     ms = 1e3 * (time.perf_counter() - started)
     if len(answer) == 2 and (answer[1] is None or isinstance(answer[1], np.ndarray)):
         matrix, mask = answer
-        return Outcome(0 if mask is None else int(np.count_nonzero(mask)), matrix is not None, ms)
+        kept = 0 if mask is None else int(np.count_nonzero(mask))
+        return Outcome(kept, matrix is not None and kept > 0, ms)
     return Outcome(len(answer), len(answer) > 0, ms)
 
 
@@ -121,6 +159,8 @@ def run_script(path: Path, arguments: Sequence[str]) -> CallLog:
         module, attribute = locate(name)
         if hasattr(module, attribute):
             recording[name] = log.recording(name, getattr(module, attribute), twin)
+    for name in UNCOVERED:
+        recording[name] = log.counting(name, getattr(cv2, name))
     sys.argv = [str(path), *arguments]
     sys.path.insert(0, str(path.resolve().parent))
     try:
@@ -134,7 +174,7 @@ def run_script(path: Path, arguments: Sequence[str]) -> CallLog:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = the script ended, 2 = there is no script or no filter; else what the script exits with."""
-    parser = argparse.ArgumentParser(prog="python -m mgca_filter run", description=__doc__)
+    parser = argparse.ArgumentParser(prog="mgca-match run", description=__doc__)
     parser.add_argument("script", type=Path, help="Python script that calls cv2")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help="what the script gets")
     options = parser.parse_args(arguments)

@@ -15,27 +15,47 @@ What OpenCV's arguments mean here, for :func:`findEssentialMat` and :func:`findF
 - *UsacParams*: ``confidence``, ``threshold``, ``maxIterations`` and ``randomGeneratorState`` as above, ``score``
   chooses MAGSAC; the rest is not used.
 
-What comes back: a matrix (3, 3) float64, never several stacked, or None; and always a mask (N, 1) of 0 and 1, uint8.
-Data never raises. Where the images differ by a rotation alone there is no essential matrix: it is None, and the mask
-marks the matches that agree with the rotation. ``mgca_filter``'s log (level INFO) tells the status of every call.
+What comes back: a matrix (3, 3) float64, never several stacked, and always a mask (N, 1) of 0 and 1, uint8. A script
+that hands the matrix on, to ``cv2.recoverPose`` say, gets one wherever OpenCV would have given one: where the filter
+stands by none (a camera that only turns or stands still, unrelated images) it is the best that its robust fit found,
+else OpenCV's own, and the mask tells what is right about it: the matches that agree with the rotation, or none. It is
+None where OpenCV finds nothing either. Data never raises. ``mgca_filter``'s log (level INFO) tells the status of every
+call; :func:`mgca_filter.filter_matches` gives it as a value.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from ..match_filter import filter_matches
-from .fit import Answer, fit_essential, fit_fundamental, read_fit, read_params, solve_fundamental
+from ..geometry.cameras import mean_focal_length
+from ..inputs.keypoints import read_keypoints
+from ..inputs.options import FilterOptions, check_integer, check_number
+from ..inputs.pair import MatchPair
+from ..match_filter import MatchFilter, filter_matches
+from ..result import FilterResult
 from .overloads import call_overload
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.uint8]
+Answer = tuple["Array | None", Mask]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SOLVERS = (cv2.FM_7POINT, cv2.FM_8POINT)
+# A focal length, or without one an extent of the points, below this is no number of pixels: the caller normalised.
+_FEWEST_PIXELS = 10.0
+# The filter's own thresholds are pixels; an image of this size stands in where the points are normalised.
+_USUAL_PIXELS = 1000.0
+# Bound at import, like those of the robust fit: the names in cv2 may be swapped.
+_find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
+
 
 _log = logging.getLogger("mgca_filter")
 
@@ -60,8 +80,8 @@ def findEssentialMat(*args: Any, **kwargs: Any) -> Answer:
     Points are arrays (N, 2), (N, 1, 2) or (1, N, 2), pixels; see the module for the meaning of the other arguments.
 
     Returns:
-        E (3, 3) float64 of unit Frobenius norm, rank 2 and two equal singular values, ``x2^T E x1 = 0``, or None; and
-        the mask (N, 1) uint8.
+        E (3, 3) float64 of unit Frobenius norm, rank 2 and two equal singular values, ``x2^T E x1 = 0``, or None
+        where OpenCV finds none either; and the mask (N, 1) uint8.
 
     Raises:
         TypeError: the arguments fit no overload. ValueError: one has another shape or range.
@@ -133,8 +153,8 @@ def _essential_of_one_camera(
     maxIters: int = 1000,
     mask: Any = None,
 ) -> Answer:
-    fit = read_fit(method, prob, threshold, maxIters)
-    return fit_essential(points1, points2, cameraMatrix, cameraMatrix, None, None, fit, mask)
+    fit = _read_fit(method, prob, threshold, maxIters)
+    return _fit_essential(points1, points2, cameraMatrix, cameraMatrix, None, None, fit, mask)
 
 
 def _essential_of_focal_length(
@@ -149,7 +169,7 @@ def _essential_of_focal_length(
     mask: Any = None,
 ) -> Answer:
     K = np.array([[focal, 0.0, pp[0]], [0.0, focal, pp[1]], [0.0, 0.0, 1.0]])
-    return fit_essential(points1, points2, K, K, None, None, read_fit(method, prob, threshold, maxIters), mask)
+    return _fit_essential(points1, points2, K, K, None, None, _read_fit(method, prob, threshold, maxIters), mask)
 
 
 def _essential_of_two_cameras(
@@ -164,8 +184,8 @@ def _essential_of_two_cameras(
     threshold: float = 1.0,
     mask: Any = None,
 ) -> Answer:
-    fit = read_fit(method, prob, threshold, 1000)
-    return fit_essential(points1, points2, cameraMatrix1, cameraMatrix2, distCoeffs1, distCoeffs2, fit, mask)
+    fit = _read_fit(method, prob, threshold, 1000)
+    return _fit_essential(points1, points2, cameraMatrix1, cameraMatrix2, distCoeffs1, distCoeffs2, fit, mask)
 
 
 def _essential_by_params(
@@ -178,8 +198,8 @@ def _essential_by_params(
     params: cv2.UsacParams,
     mask: Any = None,
 ) -> Answer:
-    fit = read_params(params)
-    return fit_essential(points1, points2, cameraMatrix1, cameraMatrix2, dist_coeff1, dist_coeff2, fit, mask)
+    fit = _read_params(params)
+    return _fit_essential(points1, points2, cameraMatrix1, cameraMatrix2, dist_coeff1, dist_coeff2, fit, mask)
 
 
 def _fundamental_of_points(
@@ -203,14 +223,137 @@ def _fundamental_with_limit(
     mask: Any = None,
 ) -> Answer:
     if method in _SOLVERS:
-        return solve_fundamental(points1, points2, method, mask)
+        return _solve_fundamental(points1, points2, method, mask)
     threshold = ransacReprojThreshold if ransacReprojThreshold > 0 else 3.0
     confidence = confidence if 0.0 < confidence < 1.0 else 0.99
-    return fit_fundamental(points1, points2, read_fit(method, confidence, threshold, maxIters), mask)
+    return _fit_fundamental(points1, points2, _read_fit(method, confidence, threshold, maxIters), mask)
 
 
 def _fundamental_by_params(points1: Any, points2: Any, params: cv2.UsacParams, mask: Any = None) -> Answer:
-    return fit_fundamental(points1, points2, read_params(params), mask)
+    return _fit_fundamental(points1, points2, _read_params(params), mask)
+
+
+def _read_fit(method: int, confidence: float, threshold: float, max_iterations: int, seed: int = 0) -> FilterOptions:
+    """Options of the filter from OpenCV's scalar arguments; the threshold stays in the unit of the points.
+
+    Raises:
+        TypeError, ValueError: one is of another type or range.
+    """
+    return FilterOptions(
+        threshold=check_number(threshold, "threshold", 0.0, float("inf")),
+        confidence=check_number(confidence, "prob", 0.0, 1.0),
+        method="magsac" if method == cv2.USAC_MAGSAC else FilterOptions.method,
+        max_iterations=check_integer(max_iterations, "maxIters", 1),
+        seed=seed,
+    )
+
+
+def _read_params(params: cv2.UsacParams) -> FilterOptions:
+    """The same from ``cv2.UsacParams``; errors as :func:`_read_fit`."""
+    method = cv2.USAC_MAGSAC if params.score == cv2.SCORE_METHOD_MAGSAC else cv2.RANSAC
+    seed = abs(int(params.randomGeneratorState))
+    return _read_fit(method, params.confidence, params.threshold, params.maxIterations, seed)
+
+
+def _fit_essential(
+    points1: Any, points2: Any, K1: Any, K2: Any, dist1: Any, dist2: Any, options: FilterOptions, mask: Any
+) -> Answer:
+    """E (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findEssentialMat``."""
+    points1, points2 = _read_points(points1, points2)
+    K1, K2 = (np.asarray(K, dtype=np.float64) for K in (K1, K2))
+    focal = mean_focal_length(K1, K2) if K1.shape == K2.shape == (3, 3) else 0.0
+    if 0.0 < focal < _FEWEST_PIXELS:
+        zoom = _USUAL_PIXELS / focal
+        K1, K2 = (np.diag([zoom, zoom, 1.0]) @ K for K in (K1, K2))
+        points1, points2 = points1 * zoom, points2 * zoom
+        options = replace(options, threshold=options.threshold * zoom)
+    pair = MatchPair(points1, points2, None, K1, K2, _coefficients(dist1), _coefficients(dist2))
+    result = _run(pair, options, "findEssentialMat")
+    E = result.E if result.E is not None else result.info["fitted_essential"]
+    if E is None:
+        E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
+    return E, _as_opencv_mask(result.mask, mask)
+
+
+def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: Any) -> Answer:
+    """F (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findFundamentalMat``."""
+    points1, points2 = _read_points(points1, points2)
+    extent = max(_extent(points1), _extent(points2))
+    zoom = np.eye(3)
+    if 0.0 < extent < _FEWEST_PIXELS:
+        factor = _USUAL_PIXELS / extent
+        zoom = np.array([[factor, 0.0, _USUAL_PIXELS], [0.0, factor, _USUAL_PIXELS], [0.0, 0.0, 1.0]])
+        points1, points2 = (points * factor + _USUAL_PIXELS for points in (points1, points2))
+        options = replace(options, threshold=options.threshold * factor)
+    result = _run(MatchPair(points1, points2, None), options, "findFundamentalMat")
+    F = result.F if result.F is not None else _find_by_opencv(_find_fundamental_mat, points1, points2)
+    return _scaled(None if F is None else zoom.T @ F @ zoom), _as_opencv_mask(result.mask, mask)
+
+
+def _find_by_opencv(function: Callable[..., Any], points1: Array, points2: Array, *arguments: Any) -> Array | None:
+    """The matrix (3, 3) of OpenCV's own function, the first where it stacks several; None where it finds none."""
+    usable = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
+    try:
+        M, _ = function(points1[usable], points2[usable], *arguments)
+    except cv2.error:
+        return None
+    if M is None or np.shape(M)[0] < 3 or not np.isfinite(M[:3]).all():
+        return None
+    return np.asarray(M[:3], dtype=np.float64)
+
+
+def _solve_fundamental(points1: Any, points2: Any, method: int, mask: Any) -> Answer:
+    """OpenCV's 7- and 8-point solver; None and an empty mask where it refuses the points."""
+    points1, points2 = _read_points(points1, points2)
+    try:
+        F, kept = _find_fundamental_mat(points1, points2, method)
+    except cv2.error:
+        F = None
+    inliers = np.zeros(len(points1), dtype=bool) if F is None else np.asarray(kept).ravel() > 0
+    return None if F is None else np.asarray(F, dtype=np.float64), _as_opencv_mask(inliers, mask)
+
+
+def _run(pair: MatchPair, options: FilterOptions, name: str) -> FilterResult:
+    result = MatchFilter(**vars(options)).filter_many([pair])[0]
+    _log.info("%s: %s, %d of %d matches", name, result.status.value, result.num_inliers, len(result.mask))
+    return result
+
+
+def _read_points(points1: Any, points2: Any) -> tuple[Array, Array]:
+    """Pixels (N, 2), (N, 2) from the layouts that OpenCV takes."""
+    both = []
+    for name, points in (("points1", points1), ("points2", points2)):
+        both.append(read_keypoints(points, name).points)
+    if len(both[0]) != len(both[1]):
+        raise ValueError(f"points2: expected {len(both[0])} points like points1, got {len(both[1])}")
+    return both[0], both[1]
+
+
+def _coefficients(dist: Any) -> Any:
+    """OpenCV takes an empty array for no distortion."""
+    return None if dist is None or np.size(dist) == 0 else dist
+
+
+def _extent(points: Array) -> float:
+    finite = points[np.isfinite(points).all(axis=1)]
+    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+
+
+def _scaled(F: Array | None) -> Array | None:
+    """OpenCV's scale: F[2, 2] = 1, where it is not zero."""
+    if F is None:
+        return None
+    F = F / np.linalg.norm(F)
+    return F / F[2, 2] if abs(F[2, 2]) > 1e-12 else F
+
+
+def _as_opencv_mask(inliers: NDArray[np.bool_], mask: Any) -> Mask:
+    """The mask (N, 1) of 0 and 1, in the caller's array where that fits."""
+    column = inliers.astype(np.uint8)[:, None]
+    if isinstance(mask, np.ndarray) and mask.dtype == np.uint8 and mask.shape == column.shape:
+        mask[:] = column
+        return mask
+    return column
 
 
 _ESSENTIAL_OVERLOADS = (

@@ -10,7 +10,7 @@ import pytest
 from conftest import K, Scene, make_scene
 
 from mgca_filter.fit import robust_fit
-from mgca_filter.fit.estimators import METHODS, fit_epipolar, fit_homography, usac_params
+from mgca_filter.fit.estimators import fit_epipolar, fit_homography, usac_params
 from mgca_filter.fit.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
 from mgca_filter.fit.robust_fit import (
     SINGLE_START,
@@ -24,6 +24,7 @@ from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import cross_matrix, essential_from_pose, pose_error_deg
 from mgca_filter.geometry.homography import homography_distance, poses_from_homography
 from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector, truncated_cost
+from mgca_filter.inputs.options import METHODS
 
 FOCAL = K[0, 0]
 ESTIMATORS = [method for method in METHODS if method != "none"]

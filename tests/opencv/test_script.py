@@ -133,6 +133,48 @@ def test_table_comes_after_a_crash_and_without_calls(tmp_path: Path) -> None:
     assert "no call that the filter takes over" in done.stderr
 
 
+def test_what_the_filter_did_not_see_is_told(tmp_path: Path) -> None:
+    code = """
+import subprocess, sys
+import cv2
+import numpy as np
+p = np.random.default_rng(0).uniform(0, 500, (40, 2))
+K, D = np.eye(3), np.zeros(4)
+for _ in range(3):
+    cv2.findHomography(p, p, cv2.RANSAC)
+M = cv2.estimateAffine2D(p, p)
+cv2.recoverPose(p, p + 1, K, D, K, D)
+cv2.recoverPose(np.eye(3), p, p)
+if len(sys.argv) > 1:
+    subprocess.run([sys.executable, "-c", "sum(range(10**6))"])
+"""
+    for arguments, expected in (((), False), (("child",), True)):
+        done = run(tmp_path, code, *arguments)
+        assert done.returncode == 0, done.stderr
+        told = done.stderr[done.stderr.index("in place of OpenCV") :]
+        assert "not taken over: script.py:8 findHomography, 3 calls" in told
+        assert "not taken over: script.py:9 estimateAffine2D, 1 calls" in told
+        assert "not taken over: script.py:10 recoverPose, 1 calls" in told
+        assert told.count("recoverPose") == 1
+        assert ("other processes" in told) == expected
+
+
+def test_a_standing_camera_does_not_stop_a_script(tmp_path: Path) -> None:
+    code = """
+import cv2
+import numpy as np
+rng = np.random.default_rng(0)
+K = np.array([[400, 0, 320], [0, 400, 240], [0, 0, 1.0]])
+p = rng.uniform((0, 0), (640, 480), (500, 2)).astype(np.float32)
+q = p + rng.normal(0, 0.02, p.shape).astype(np.float32)
+E, mask = cv2.findEssentialMat(q, p, K, cv2.RANSAC, 0.999, 1.0)
+print(cv2.recoverPose(E, q, p, K, mask=mask)[1].shape)
+"""
+    done = run(tmp_path, code)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == "(3, 3)"
+
+
 def test_missing_script_and_the_other_commands() -> None:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     for arguments, status, words in (

@@ -16,7 +16,7 @@ from conftest import SIZE, K, Scene, make_scene
 
 import mgca_filter
 from mgca_filter import Status, filter_matches, findEssentialMat, findFundamentalMat, matchMGCA, patch_cv2
-from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
+from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg, sampson_distance
 from mgca_filter.opencv.twins import _ESSENTIAL_OVERLOADS, _FUNDAMENTAL_OVERLOADS
 
 TWINS = {"E": lambda p1, p2: findEssentialMat(p1, p2, K), "F": findFundamentalMat}
@@ -215,11 +215,35 @@ def test_solvers_are_opencvs_own(scene: Scene) -> None:
     assert findFundamentalMat(np.zeros((3, 2)), np.zeros((3, 2)), cv2.FM_8POINT)[0] is None
 
 
-def test_rotation_has_no_essential_matrix_but_a_mask() -> None:
+def test_a_rotation_keeps_its_matches_and_a_matrix_to_hand_on() -> None:
     turned = make_scene("rotation")
     E, mask = findEssentialMat(turned.points1, turned.points2, K)
-    assert E is None
     assert mask[turned.inlier].mean() > 0.8
+    _, R, _, _ = cv2.recoverPose(E, turned.points1, turned.points2, K, mask=mask)
+    assert rotation_error_deg(R, turned.R) < 1.0
+
+
+def test_a_standing_camera_does_not_stop_an_unchanged_script() -> None:
+    rng = np.random.default_rng(0)
+    before = rng.uniform((0, 0), (640, 480), (500, 2)).astype(np.float32)
+    after = before + rng.normal(0, 0.02, before.shape).astype(np.float32)
+    with mgca_filter.patch_cv2():
+        E, mask = cv2.findEssentialMat(after, before, K, cv2.RANSAC, 0.999, 1.0)
+        _, R, _, _ = cv2.recoverPose(E, after, before, K, mask=mask.copy())
+        F, _ = cv2.findFundamentalMat(after, before, cv2.FM_RANSAC)
+    assert rotation_error_deg(R, np.eye(3)) < 1.0
+    assert mask.mean() > 0.9
+    assert F.shape == (3, 3)
+
+
+@pytest.mark.parametrize("count", [5, 6, 7, 8, 30])
+def test_a_matrix_wherever_opencv_has_one(count: int) -> None:
+    points1, points2 = np.random.default_rng(count).uniform(0, 600, (2, count, 2))
+    E, mask = findEssentialMat(points1, points2, K)
+    theirs, _ = cv2.findEssentialMat(points1, points2, K)
+    assert (E is None) == (theirs is None)
+    assert E is None or E.shape == (3, 3)
+    assert not mask.any()
 
 
 @pytest.mark.parametrize("arguments", [("K",), (K, "ransac"), (K, None, K), (K, 8, 0.999, 1.0, 1000, None, 1)])
@@ -270,10 +294,9 @@ def test_data_never_raises(twin: Callable, points: np.ndarray) -> None:
 def test_only_outliers_keep_nothing() -> None:
     draws = [np.random.default_rng(seed).uniform(0, 600, (2, 300, 2)) for seed in range(20)]
     answers = {name: [twin(*points) for points in draws] for name, twin in TWINS.items()}
-    assert all(E is None for E, _ in answers["E"])
+    assert not any(mask.any() for _, mask in answers["E"])
     # Without intrinsics chance fits better: of uniformly random points one F in ten passes.
-    assert sum(F is not None for F, _ in answers["F"]) <= 2
-    assert not any(mask.any() for M, mask in answers["E"] + answers["F"] if M is None)
+    assert sum(mask.any() for _, mask in answers["F"]) <= 2
 
 
 def test_twenty_thousand_points() -> None:
