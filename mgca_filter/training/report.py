@@ -19,7 +19,9 @@ from tqdm import tqdm
 
 from ..data.scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from ..errors import BundleError, MgcaFilterError
-from ..network import MGCANet, load_network
+from ..inference.network_backend import NetworkBackend
+from ..match_filter import MatchFilter
+from ..network import load_network
 from .sampling import SamplingConfig
 from .validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
 
@@ -28,11 +30,11 @@ Summary = dict[str, dict[str, dict[str, Any]]]  # scenes → kind of input → f
 Figures = dict[str, dict[str, list[PairFigures]]]  # scenes → kind of input → pairs
 
 
-def evaluate(network: MGCANet, groups: Mapping[str, Sequence[ScenePair]]) -> Figures:
+def evaluate(match_filter: MatchFilter, groups: Mapping[str, Sequence[ScenePair]]) -> Figures:
     """Figures of every group of pairs with every kind of input."""
     return {
         group: {
-            kind: [evaluate_pair(network, pair, choose(pair)) for pair in tqdm(pairs, desc=f"{group}, {kind}")]
+            kind: [evaluate_pair(match_filter, pair, choose(pair)) for pair in tqdm(pairs, desc=f"{group}, {kind}")]
             for kind, choose in INPUT_KINDS.items()
         }
         for group, pairs in groups.items()
@@ -155,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MgcaFilterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    summary = summarize_all(evaluate(network, groups))
+    summary = summarize_all(evaluate(MatchFilter.over(NetworkBackend(network)), groups))
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "report.json").write_text(json.dumps({"command": command, **summary}, indent=1), encoding="utf-8")
     write_markdown(summary, options.out / "report.md", command)
