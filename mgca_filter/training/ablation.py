@@ -13,12 +13,12 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ..atomic_file import replaced_when_done
 from ..data.scene_bundle import ScenePair, load_scene_bundles
@@ -251,13 +251,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         ablation, rows = prepare(options)
         done: list[dict[str, Any]] = []
-        for number, row in enumerate(rows, 1):
-            start = time.perf_counter()
-            done.append(ablation.run_row(row))
-            ablation.write(done, command)
-            seconds = time.perf_counter() - start
-            left = timedelta(seconds=round(seconds * (len(rows) - number)))
-            print(f"{row.name}: {seconds:.0f} s; {len(rows) - number} rows left, about {left} at this pace")
+        with tqdm(rows, unit="row") as progress:
+            for row in progress:
+                progress.set_postfix_str(row.name)
+                done.append(ablation.run_row(row))
+                ablation.write(done, command)
     except (ConfigError, MgcaFilterError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
