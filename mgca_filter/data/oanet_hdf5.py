@@ -6,7 +6,6 @@ the format that later papers of the family share).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -71,9 +70,6 @@ class OanetFile:
 
     def __len__(self) -> int:
         return self._count
-
-    def __iter__(self) -> Iterator[OanetPair]:
-        return (self[index] for index in range(len(self)))
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None}

@@ -96,3 +96,9 @@ def test_a_broken_pair_is_named_and_leaves_the_others_readable(
     with pytest.raises(DatasetError, match=message):
         dump[1]
     assert len(dump[0].correspondences) == 200
+
+
+def test_what_is_not_read_breaks_no_pair(tmp_path: Path, scenes: list[Scene]):
+    """Distances to the true geometry follow from the pose: those of the dump are of no use."""
+    dump = OanetFile(write_oanet(tmp_path / "dump.hdf5", scenes, {"ys/1": np.full(7, np.nan)}))
+    assert len(dump[1].correspondences) == 71

@@ -28,12 +28,11 @@ from mgca_filter.training.samples import (
     has_variety,
     virtual_correspondences,
 )
-from mgca_filter.training.sampling import SamplingConfig
+from mgca_filter.training.sampling import DISTANCE_COLUMNS, SHAPE_COLUMNS, SamplingConfig
 from mgca_filter.training.sources import BundleSource, is_held_out
 
 SAMPLING = SamplingConfig(batch_size=4, matches=(40, 64), matches_weights=(0.5, 0.5), holdout_every=3, pool_batches=2)
 UNCHANGED = AugmentationConfig(tilt_deg=0.0, roll_deg=0.0, turn=0.0, mirror=0.0, focal_error=0.0)
-GEOMETRY, RATIO_AND_BEST = [2, 3, 4, 7], [0, 1, 5, 6]
 
 
 @pytest.fixture(scope="module")
@@ -206,8 +205,8 @@ def test_candidates_are_best_of_the_list_and_below_the_ratio(bundles):
         assert (kept[:, 1] == 1).all()
         encoded = scene_pair(bundles, draw.pair).attributes.encode(len(draw.attributes))
         assert len(draw.rows) == np.count_nonzero((encoded[:, 0] < 0.95) & (encoded[:, 1] == 1))
-        np.testing.assert_array_equal(draw.attributes[:, RATIO_AND_BEST], encoded[:, RATIO_AND_BEST])
-        forgotten += int((draw.attributes[:, GEOMETRY] == 0).all())
+        np.testing.assert_array_equal(draw.attributes[:, DISTANCE_COLUMNS], encoded[:, DISTANCE_COLUMNS])
+        forgotten += int((draw.attributes[:, SHAPE_COLUMNS] == 0).all())
     assert 0 < forgotten < 25  # sizes and angles are unknown now and then
 
 

@@ -63,9 +63,10 @@ def test_a_pair_follows_from_the_generator_in_every_process(kind, data):
     source = open_kind(kind, data)
     copy = pickle.loads(pickle.dumps(source))
     drawn = source.draw(np.random.default_rng(3))
-    copy.draw(np.random.default_rng(8))  # another history
+    others = [copy.draw(np.random.default_rng(8))]  # another history
     assert_same(drawn, copy.draw(np.random.default_rng(3)))
-    others = [source.draw(np.random.default_rng(seed)) for seed in range(4, 10 if kind != "rendered" else 5)]
+    if kind != "rendered":  # slow, and no two worlds are alike
+        others += [source.draw(np.random.default_rng(seed)) for seed in range(4, 10)]
     assert any(len(o) != len(drawn) or (o.correspondences != drawn.correspondences).any() for o in others)
 
 

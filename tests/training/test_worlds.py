@@ -183,9 +183,9 @@ def test_the_command_writes_a_bundle_that_workers_do_not_change(photos, tmp_path
         right = bundle[index].correspondences[labels == POSITIVE]
         assert len(right) >= 20
         assert symmetric_epipolar_distance_squared(right, bundle[index].E).max() < 1.6e-5
-    assert main([*command[:-1], "7", "--workers", "0"]) == 0
+    assert main([*command[:-1], "7", "--workers", "0", "--pairs", "1"]) == 0
     other = load(tmp_path / "out.npz")
-    assert (other["K"] != alone["K"]).any()
+    assert (other["K"] != alone["K"][:2]).all(axis=0).any()
 
 
 def test_photographs_that_cannot_be_used_are_named(tmp_path, capsys):
