@@ -151,7 +151,7 @@ class MatchFilter:
             model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, job.network_essential)
             job.timings_ms["fit"] = _milliseconds_since(started)
             started = time.perf_counter()
-            verdict = judge(pair, model, ranked, self.options.threshold, self.fit_options)
+            verdict = judge(pair, model, ranked, pair.threshold_px(self.options.threshold), self.fit_options)
             if self.options.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
@@ -199,7 +199,6 @@ class MatchFilter:
         return kept
 
     def _describe(self, job: _Job) -> dict[str, Any]:
-        cameras = (job.pair.intrinsics1, job.pair.intrinsics2)
         job.timings_ms["total"] = sum(job.timings_ms.values())
         return {
             "timings_ms": job.timings_ms,
@@ -207,7 +206,7 @@ class MatchFilter:
             "model": self._backend.metadata.name,
             "model_sha256": self._backend.metadata.sha256,
             "intrinsics": "given" if job.pair.calibrated else "guessed",
-            "assumptions": [camera.assumption for camera in cameras if camera.assumption],
+            "assumptions": list(job.pair.assumptions),
             "num_network_matches": len(job.sent.rows),
             "network_essential": job.network_essential,
         }

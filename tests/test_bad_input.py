@@ -232,7 +232,7 @@ SINGULAR, HOMOGENEOUS = np.zeros((3, 3)), np.diag([1.0, 1.0, 2.0])
         ("confidence", 0.0, ValueError),
         ("confidence", None, TypeError),
         ("method", "lmeds", ValueError),
-        ("method", 8, TypeError),
+        ("method", 3.5, TypeError),
         ("backend", "tensorflow", ValueError),
         ("backend", None, TypeError),
         ("seed", -1, ValueError),

@@ -43,10 +43,16 @@ def test_the_doors_take_the_same_arguments() -> None:
     """The lists that a reader sees are written out; none of them may fall behind."""
     pair, options = signature(MatchPair).parameters, signature(MatchFilter).parameters
     function, method = signature(filter_matches).parameters, signature(MatchFilter.filter).parameters
+    shared_K = {"K": None}  # another word for K1 alone
     assert {name: p.default for name, p in function.items()} == {
-        name: p.default for name, p in {**pair, **options}.items()
+        **{name: p.default for name, p in {**pair, **options}.items()},
+        **shared_K,
     }
-    assert [(p.name, p.default) for p in method.values()][1:] == [(p.name, p.default) for p in pair.values()]
+    assert {p.name: p.default for p in list(method.values())[1:]} == {
+        **{p.name: p.default for p in pair.values()},
+        **shared_K,
+    }
+    assert [p.name for p in method.values()][1:4] == ["kp1", "kp2", "matches"]
 
 
 def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:

@@ -95,7 +95,7 @@ def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, 
     else:
         distance_px = sampson_distance(np.hstack(pair.pixels(pair.valid)), F)
     mask[pair.valid] = distance_px < mask_threshold_px
-    return Verdict(Status.OK, mask, model.E, F, model.R, model.t, info)
+    return Verdict(Status.OK, mask, model.E, pair.fundamental_in_units(F), model.R, model.t, info)
 
 
 def _contradicts_intrinsics(
@@ -132,11 +132,11 @@ def _test_degenerate(
     if degeneracy.explains(homography_distance(points1, points2, H), threshold_px, support):
         mask = np.zeros(len(pair.valid), dtype=bool)
         mask[pair.valid] = homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
-        info = {**verdict.info, "homography": H / H[2, 2]}
+        info = {**verdict.info, "homography": pair.homography_in_units(H)}
         return Verdict(Status.PURE_ROTATION, mask, R=R, info=info)
     plane = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * threshold_px, options.seed)
     if plane is not None and degeneracy.explains(homography_distance(points1, points2, plane), threshold_px, support):
-        info = {**verdict.info, "homography": plane}
+        info = {**verdict.info, "homography": pair.homography_in_units(plane)}
         if pair.calibrated:
             return replace(verdict, status=Status.PLANAR, info=info)
         # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.

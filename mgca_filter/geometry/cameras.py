@@ -12,12 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 from .epipolar import homogeneous
 
 GUESSED_FOCAL_FACTOR = 1.2
+# Removing distortion moves points a little out of the image; further out than this share of their extent, and the
+# origin is no corner of it.
+_OUTSIDE_SHARE = 0.1
 # A coordinate beyond this comes from broken input and says nothing of the size of an image.
 _LARGEST_PX = 1e6
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
 # The five steps that OpenCV takes unasked leave errors of a pixel in the corners of a wide lens.
 _UNDISTORT_STEPS = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-_UNDISTORTED_WITHIN_PX = 0.1
+_UNDISTORTED_WITHIN = 1e-4  # of the focal length
 
 
 @dataclass(frozen=True)
@@ -102,19 +105,24 @@ def _undistort(
         normalized = cv2.undistortPoints(*arguments, criteria=_UNDISTORT_STEPS)
     nowhere = np.zeros(3)
     distorted, _ = cv2.projectPoints(homogeneous(normalized[:, 0]), nowhere, nowhere, K, coefficients)
-    reached = np.linalg.norm(distorted[:, 0] - points, axis=1) < _UNDISTORTED_WITHIN_PX
+    reached = np.linalg.norm(distorted[:, 0] - points, axis=1) < _UNDISTORTED_WITHIN * K[0, 0]
     return np.where(reached[:, None], normalized[:, 0], np.nan)
 
 
 def _guess(points: NDArray[np.float64], size: tuple[float, float] | None, image: int) -> Intrinsics:
     source = "the image size"
+    corner = np.zeros(2)
     if size is None:
         usable = points[(np.abs(points) < _LARGEST_PX).all(axis=1)]
-        width, height = (np.max(usable, axis=0) + 1.0) if len(usable) else (1.0, 1.0)
+        usable = usable if len(usable) else np.zeros((1, 2))
+        # Points left of or above the image say that its corner is not the origin: the middle is that of the points.
+        corner = np.where(usable.min(axis=0) < -_OUTSIDE_SHARE * np.ptp(usable, axis=0), usable.min(axis=0), 0.0)
+        width, height = np.max(usable, axis=0) - corner + 1.0
         size = (max(float(width), 1.0), max(float(height), 1.0))
         source = "the extent of the keypoints"
     focal = GUESSED_FOCAL_FACTOR * max(size)
-    K = np.array([[focal, 0.0, (size[0] - 1.0) / 2.0], [0.0, focal, (size[1] - 1.0) / 2.0], [0.0, 0.0, 1.0]])
+    cx, cy = corner + (np.array(size) - 1.0) / 2.0
+    K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     return Intrinsics(K, None, True, f"focal length {focal:.0f} px of image {image} guessed from {source}")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,16 @@ from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
 from .matches import PutativeMatches, read_matches
 
+# Coordinates are taken for pixels unless both the focal length and the extent of the keypoints are smaller than any
+# camera's, as where the caller normalised the points or measures in millimetres on the sensor. Without a focal length
+# the extent alone must be that of normalised points.
+_LEAST_FOCAL_PX, _LEAST_EXTENT_PX, _LEAST_EXTENT_ALONE_PX = 100.0, 50.0, 10.0
+# Then a pixel is this part of the focal length, or of the extent.
+_USUAL_PIXELS = 1000.0
+# A threshold above this part of the focal length or extent is meant in pixels all the same.
+_LARGEST_THRESHOLD_SHARE = 0.01
+# Images of one camera differ no more than this in size, unless one of them was resized, cropped or turned.
+_SAME_SIZE_SHARE = 0.01
 # Normalised coordinates beyond this (89.9 degrees off the axis) come from broken input, not from a lens.
 _MAX_NORMALIZED = 1e3
 
@@ -44,7 +54,11 @@ class PairInput:
         correspondences: (M, 4) float64, normalised; NaN where a row has no usable coordinates.
         valid: (M,) bool, rows with usable coordinates.
         attributes: (M, 8) float32, encoded.
-        intrinsics1, intrinsics2: cameras, given or guessed.
+        intrinsics1, intrinsics2: cameras, given or guessed, in pixels.
+        unit_px: pixels to a unit of the caller's coordinates: 1, or where these are normalised or millimetres, the
+            number that makes pixels of them.
+        largest_threshold: a threshold above this is in pixels already, whatever the unit.
+        assumptions: sentences on what was assumed.
     """
 
     matches: PutativeMatches
@@ -55,6 +69,9 @@ class PairInput:
     attributes: NDArray[np.float32]
     intrinsics1: Intrinsics
     intrinsics2: Intrinsics
+    unit_px: float = 1.0
+    largest_threshold: float = float("inf")
+    assumptions: tuple[str, ...] = ()
 
     @property
     def calibrated(self) -> bool:
@@ -65,6 +82,22 @@ class PairInput:
     def focal_px(self) -> float:
         """Mean focal length in pixels."""
         return mean_focal_length(self.intrinsics1.K, self.intrinsics2.K)
+
+    def threshold_px(self, threshold: float) -> float:
+        """The caller's threshold in pixels."""
+        return threshold if threshold > self.largest_threshold else threshold * self.unit_px
+
+    def fundamental_in_units(self, F: NDArray[np.float64]) -> NDArray[np.float64]:
+        """F (3, 3) for pixels as one for the caller's coordinates, of unit Frobenius norm."""
+        unit = np.diag([self.unit_px, self.unit_px, 1.0])
+        F = unit @ F @ unit
+        return np.asarray(F / np.linalg.norm(F), dtype=np.float64)
+
+    def homography_in_units(self, H: NDArray[np.float64]) -> NDArray[np.float64]:
+        """H (3, 3) for pixels as one for the caller's coordinates, scaled to H[2, 2] = 1 where that is not zero."""
+        unit = np.diag([self.unit_px, self.unit_px, 1.0])
+        H = np.linalg.inv(unit) @ H @ unit
+        return np.asarray(H / H[2, 2] if abs(H[2, 2]) > 1e-12 else H, dtype=np.float64)
 
     def pixels(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Undistorted pixels (K, 2), (K, 2) of a selection of matches."""
@@ -81,7 +114,29 @@ def prepare_pair(pair: MatchPair) -> PairInput:
     keypoints1, keypoints2 = read_keypoints(pair.kp1, "kp1"), read_keypoints(pair.kp2, "kp2")
     putative = read_matches(pair.matches, len(keypoints1), len(keypoints2))
     cameras = {name: getattr(pair, name) for name in ("K1", "K2", "dist1", "dist2", "size1", "size2")}
-    intrinsics1, intrinsics2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
+    _check_shared_camera(pair)
+    given1, given2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
+    extent = max(_extent(keypoints1.points), _extent(keypoints2.points))
+    unit_px, yardstick = _pixels_per_unit(given1, given2, extent)
+    points1, points2 = keypoints1.points * unit_px, keypoints2.points * unit_px
+    if unit_px == 1.0:
+        intrinsics1, intrinsics2 = given1, given2
+    elif given1.guessed:
+        intrinsics1, intrinsics2 = resolve_intrinsics(points1, points2)
+    else:
+        zoom = np.diag([unit_px, unit_px, 1.0])
+        intrinsics1, intrinsics2 = (replace(camera, K=zoom @ camera.K) for camera in (given1, given2))
+    assumptions = [camera.assumption for camera in (intrinsics1, intrinsics2) if camera.assumption]
+    if unit_px != 1.0:
+        assumptions.append(
+            f"coordinates are no pixels, they extend over {extent:.3g}: thresholds are those of an image in which "
+            f"{yardstick:.3g} is {_USUAL_PIXELS:g} pixels"
+        )
+    assumptions += [
+        f"the principal point of K{i} lies outside of image {i}: is it the K of another size?"
+        for i, camera, size in ((1, given1, pair.size1), (2, given2, pair.size2))
+        if not camera.guessed and size is not None and not _inside(camera.K[:2, 2], size)
+    ]
     present = (putative.index1 >= 0)[:, None]
     if present.any():
         ends = [
@@ -89,8 +144,8 @@ def prepare_pair(pair: MatchPair) -> PairInput:
             for points, index in (
                 (keypoints1.points, putative.index1),
                 (keypoints2.points, putative.index2),
-                (intrinsics1.normalize(keypoints1.points), putative.index1),
-                (intrinsics2.normalize(keypoints2.points), putative.index2),
+                (intrinsics1.normalize(points1), putative.index1),
+                (intrinsics2.normalize(points2), putative.index2),
             )
         ]
     else:
@@ -100,8 +155,52 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         valid = (np.abs(correspondences) < _MAX_NORMALIZED).all(axis=1)
     known = _merge_attributes(putative, keypoints1, keypoints2, pair.attributes)
     return PairInput(
-        putative, ends[0], ends[1], correspondences, valid, known.encode(len(putative)), intrinsics1, intrinsics2
+        putative,
+        ends[0],
+        ends[1],
+        correspondences,
+        valid,
+        known.encode(len(putative)),
+        intrinsics1,
+        intrinsics2,
+        unit_px,
+        _LARGEST_THRESHOLD_SHARE * yardstick if unit_px != 1.0 else float("inf"),
+        tuple(assumptions),
     )
+
+
+def _check_shared_camera(pair: MatchPair) -> None:
+    """Raise ValueError where one K is to be right for images of different size."""
+    if pair.K1 is None or pair.K2 is not None or pair.size1 is None or pair.size2 is None:
+        return
+    size1, size2 = np.ravel(pair.size1), np.ravel(pair.size2)
+    if size1.shape != size2.shape or size1.dtype.kind not in "iuf" or size2.dtype.kind not in "iuf":
+        return  # what is wrong with them is said when they are read
+    if (np.abs(size1 - size2) > _SAME_SIZE_SHARE * np.maximum(size1, size2)).any():
+        words = " and ".join("x".join(f"{side:g}" for side in size) for size in (size1, size2))
+        raise ValueError(f"K2: one K cannot be right for images of {words} pixels; give K1 and K2, one for each")
+
+
+def _extent(points: NDArray[np.float64]) -> float:
+    """The longer side of the box around the finite points."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+
+
+def _pixels_per_unit(intrinsics1: Intrinsics, intrinsics2: Intrinsics, extent: float) -> tuple[float, float]:
+    """How many pixels a unit of the coordinates is, and the length, in units, that is taken for 1000 pixels."""
+    if intrinsics1.guessed:
+        if 0.0 < extent < _LEAST_EXTENT_ALONE_PX:
+            return _USUAL_PIXELS / extent, extent
+        return 1.0, _USUAL_PIXELS
+    focal = mean_focal_length(intrinsics1.K, intrinsics2.K)
+    if focal < _LEAST_FOCAL_PX and extent < _LEAST_EXTENT_PX:
+        return _USUAL_PIXELS / focal, focal
+    return 1.0, _USUAL_PIXELS
+
+
+def _inside(point: NDArray[np.float64], size: SizeLike) -> bool:
+    return bool((point > 0).all() and (point < np.ravel(np.asarray(size, dtype=np.float64)) - 1.0).all())
 
 
 def _merge_attributes(

@@ -27,14 +27,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.cameras import mean_focal_length
 from ..inputs.keypoints import read_keypoints
 from ..inputs.options import FilterOptions, check_integer, check_number
 from ..inputs.pair import MatchPair
@@ -49,10 +47,6 @@ Answer = tuple["Array | None", Mask]
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SOLVERS = (cv2.FM_7POINT, cv2.FM_8POINT)
-# A focal length, or without one an extent of the points, below this is no number of pixels: the caller normalised.
-_FEWEST_PIXELS = 10.0
-# The filter's own thresholds are pixels; an image of this size stands in where the points are normalised.
-_USUAL_PIXELS = 1000.0
 # Bound at import, like those of the robust fit: the names in cv2 may be swapped.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
 
@@ -261,12 +255,6 @@ def _fit_essential(
     """E (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findEssentialMat``."""
     points1, points2 = _read_points(points1, points2)
     K1, K2 = (np.asarray(K, dtype=np.float64) for K in (K1, K2))
-    focal = mean_focal_length(K1, K2) if K1.shape == K2.shape == (3, 3) else 0.0
-    if 0.0 < focal < _FEWEST_PIXELS:
-        zoom = _USUAL_PIXELS / focal
-        K1, K2 = (np.diag([zoom, zoom, 1.0]) @ K for K in (K1, K2))
-        points1, points2 = points1 * zoom, points2 * zoom
-        options = replace(options, threshold=options.threshold * zoom)
     pair = MatchPair(points1, points2, None, K1, K2, _coefficients(dist1), _coefficients(dist2))
     result = _run(pair, options, "findEssentialMat")
     E = result.E if result.E is not None else result.info["fitted_essential"]
@@ -278,16 +266,9 @@ def _fit_essential(
 def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: Any) -> Answer:
     """F (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findFundamentalMat``."""
     points1, points2 = _read_points(points1, points2)
-    extent = max(_extent(points1), _extent(points2))
-    zoom = np.eye(3)
-    if 0.0 < extent < _FEWEST_PIXELS:
-        factor = _USUAL_PIXELS / extent
-        zoom = np.array([[factor, 0.0, _USUAL_PIXELS], [0.0, factor, _USUAL_PIXELS], [0.0, 0.0, 1.0]])
-        points1, points2 = (points * factor + _USUAL_PIXELS for points in (points1, points2))
-        options = replace(options, threshold=options.threshold * factor)
     result = _run(MatchPair(points1, points2, None), options, "findFundamentalMat")
     F = result.F if result.F is not None else _find_by_opencv(_find_fundamental_mat, points1, points2)
-    return _scaled(None if F is None else zoom.T @ F @ zoom), _as_opencv_mask(result.mask, mask)
+    return _scaled(F), _as_opencv_mask(result.mask, mask)
 
 
 def _find_by_opencv(function: Callable[..., Any], points1: Array, points2: Array, *arguments: Any) -> Array | None:
@@ -332,11 +313,6 @@ def _read_points(points1: Any, points2: Any) -> tuple[Array, Array]:
 def _coefficients(dist: Any) -> Any:
     """OpenCV takes an empty array for no distortion."""
     return None if dist is None or np.size(dist) == 0 else dist
-
-
-def _extent(points: Array) -> float:
-    finite = points[np.isfinite(points).all(axis=1)]
-    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
 
 
 def _scaled(F: Array | None) -> Array | None:
