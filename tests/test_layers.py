@@ -28,7 +28,7 @@ FLOORS = (
     ("features",),
     ("inputs",),
     ("result",),
-    ("network", "drawing", "images", "image_header"),
+    ("network", "drawing", "images", "image_header", "tables"),
     ("geometry",),
     ("types", "atomic_file"),
     ("errors",),
