@@ -24,6 +24,7 @@ from ..atomic_file import replaced_when_done
 from ..data.scene_bundle import ScenePair, load_scene_bundles
 from ..errors import MgcaFilterError
 from ..network.weights import count_parameters
+from ..tables import render_table
 from .config import ConfigError, SourceConfig, TrainingConfig, load_config
 from .datasets import TrainingDataset
 from .loop import WEIGHTS, DivergedError, Trainer
@@ -176,22 +177,21 @@ class Ablation:
         }
         text = json.dumps({"command": command, "budget": budget, "rows": list(rows)}, indent=1)
         (self.out / "ablation.json").write_text(text, encoding="utf-8")
+        several = len(self.seeds) > 1
+        cells = [
+            [row["row"], f"{row['parameters'] / 1e6:.2f} M"]
+            + [f"{row[name]:.1f}" + (f" ± {row['spread'][name] / 2:.1f}" if several else "") for name in COLUMNS]
+            for row in rows
+        ]
         lines = [
             f"`{command}`",
             "",
             f"{budget['samples']} samples a row ({self.steps} steps of {self.base.sampling.batch_size}), "
             f"seeds {', '.join(map(str, self.seeds))}, {len(self.pairs)} validation pairs; averaged over pairs"
-            + (" and seeds, ± half the range." if len(self.seeds) > 1 else "."),
+            + (" and seeds, ± half the range." if several else "."),
             "",
-            "| row | parameters | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |",
-            "|---|---:|" + "---:|" * len(COLUMNS),
+            render_table(["row", "parameters", *(name.replace("_", " ") for name in COLUMNS)], cells),
         ]
-        for row in rows:
-            cells = [
-                f"{row[name]:.1f}" + (f" ± {row['spread'][name] / 2:.1f}" if len(self.seeds) > 1 else "")
-                for name in COLUMNS
-            ]
-            lines.append(f"| {row['row']} | {row['parameters'] / 1e6:.2f} M | " + " | ".join(cells) + " |")
         (self.out / "ablation.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

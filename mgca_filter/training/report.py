@@ -22,6 +22,7 @@ from ..errors import BundleError, MgcaFilterError
 from ..inference.network_backend import NetworkBackend
 from ..match_filter import MatchFilter
 from ..network import load_network
+from ..tables import render_table
 from .sampling import SamplingConfig
 from .validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
 
@@ -69,25 +70,29 @@ def summarize_all(figures: Figures) -> Summary:
 def write_markdown(summary: Summary, path: Path, command: str) -> None:
     """Both tables, and the command that made them."""
     names = [name for name in next(iter(next(iter(summary.values())).values())) if name != "thresholds"]
-    lines = [f"`{command}`", "", "| scenes | input | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
-    for group, kinds in summary.items():
-        for kind, values in kinds.items():
-            cells = [
-                f"{v:.0f}" if name in ("pairs", "matches") else f"{v:.1f}"
-                for name, v in values.items()
-                if name in names
-            ]
-            lines.append(f"| {group} | {kind} | " + " | ".join(cells) + " |")
-    lines += ["", "Precision / recall / F against the logit threshold:", ""]
+    figures = [
+        [group, kind, *(f"{values[name]:.{0 if name in ('pairs', 'matches') else 1}f}" for name in names)]
+        for group, kinds in summary.items()
+        for kind, values in kinds.items()
+    ]
     columns = [(group, kind) for group, kinds in summary.items() for kind in kinds]
-    lines += ["| logit > | " + " | ".join(", ".join(c) for c in columns) + " |", "|---:|" + "---:|" * len(columns)]
-    for row, threshold in enumerate(THRESHOLDS):
-        studies = [summary[group][kind]["thresholds"][row] for group, kind in columns]
-        lines.append(
-            f"| {threshold:+.1f} | "
-            + " | ".join(f"{s['precision']:.1f} / {s['recall']:.1f} / {s['F']:.1f}" for s in studies)
-            + " |"
-        )
+    studies = [
+        [f"{threshold:+.1f}"]
+        + [
+            "{precision:.1f} / {recall:.1f} / {F:.1f}".format(**summary[group][kind]["thresholds"][row])
+            for group, kind in columns
+        ]
+        for row, threshold in enumerate(THRESHOLDS)
+    ]
+    lines = [
+        f"`{command}`",
+        "",
+        render_table(["scenes", "input", *names], figures, align="llr"),
+        "",
+        "Precision / recall / F against the logit threshold:",
+        "",
+        render_table(["logit >", *(", ".join(column) for column in columns)], studies, align="r"),
+    ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

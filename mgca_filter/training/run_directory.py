@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from ..evaluation.environment import library_versions, machine_description, source_commit
+from ..tables import render_table
 from .config import TrainingConfig
 
 LOG, VALIDATION, TABLE = "train.csv", "validation.csv", "validation.md"
@@ -47,9 +48,8 @@ class RunDirectory:
         """Add a row of validation figures, and draw table and curves anew."""
         self._append(VALIDATION, "validation", step, figures)
         rows = read_rows(self.folder / VALIDATION)
-        lines = [list(rows[0]), ["---:"] * len(rows[0])]
-        lines += [[row["step"], *(f"{float(v):.1f}" for k, v in row.items() if k != "step")] for row in rows]
-        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        cells = [[row["step"], *(f"{float(v):.1f}" for k, v in row.items() if k != "step")] for row in rows]
+        table = render_table(list(rows[0]), cells, align="r")
         (self.folder / TABLE).write_text(table + "\n", encoding="utf-8")
         draw_curves(self.folder / "curves.png", read_rows(self.folder / LOG), rows)
 
