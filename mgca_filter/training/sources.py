@@ -186,7 +186,7 @@ def open_sources(config: TrainingConfig, data: Path) -> OpenedSources:
         for index, source in enumerate(config.sources)
         if source.kind == "bundles"
     }
-    everything = [bundle for group in bundles.values() for bundle in group]
+    everything = list(dict.fromkeys(bundle for group in bundles.values() for bundle in group))
     names = {bundle.scene for bundle in everything}
     for key, wanted in (("scenes", config.scenes), ("tuning_scenes", config.tuning_scenes)):
         missing = [scene for scene in wanted if scene not in names]

@@ -146,11 +146,16 @@ def test_pairs_without_geometry_are_refused(tmp_path, field, message):
         bundle.check_training_pairs()
 
 
-def test_scenes_choose_among_all_bundle_sources(data):
+def test_scenes_choose_among_all_bundle_sources(data, monkeypatch):
+    opened_files = []
+    load = np.load
+    monkeypatch.setattr(np, "load", lambda path, **options: opened_files.append(path.stem) or load(path, **options))
     sources = (SourceConfig(path="bundles"), SourceConfig(path="bundles/yard.npz", weight=0.5))
     config = TrainingConfig(name="x", tuning_scenes=("hall",), sources=sources)
     opened = open_sources(config, data)
     assert [bundle.scene for bundle in opened.tuning] == ["hall"]
+    assert [bundle.scene for bundle in opened.training] == ["yard"]
+    assert opened_files == ["hall", "yard"]  # each once, whatever names it
     assert {opened.source.draw(np.random.default_rng(seed)).name[:4] for seed in range(20)} == {"yard"}
     chosen = open_sources(TrainingConfig(name="x", scenes=("hall",), sources=sources[:1]), data)
     assert {chosen.source.draw(np.random.default_rng(seed)).name[:4] for seed in range(20)} == {"hall"}
