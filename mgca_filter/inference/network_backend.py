@@ -10,6 +10,7 @@ from dataclasses import asdict
 import numpy as np
 import torch
 
+from ..errors import BackendError
 from ..inputs.attributes import ATTRIBUTE_COUNT, CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from ..network import MGCANet
 from . import ModelMetadata
@@ -39,7 +40,10 @@ class NetworkBackend:
         """One forward pass; see :class:`~mgca_filter.inference.backend.Backend`."""
         check_input(correspondences, attributes)
         device = next(self._network.parameters()).device
-        output = self._network(torch.from_numpy(correspondences).to(device), torch.from_numpy(attributes).to(device))
+        try:
+            output = self._network(*(torch.from_numpy(array).to(device) for array in (correspondences, attributes)))
+        except RuntimeError as error:
+            raise BackendError(f"PyTorch failed on a network in memory ({error})") from error
         return output.logits.float().cpu().numpy(), output.essential.float().cpu().numpy()
 
 

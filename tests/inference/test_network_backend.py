@@ -80,3 +80,14 @@ def test_a_filter_over_a_backend_takes_options(both: tuple[Backend, Backend]) ->
 def test_input_that_is_none_is_refused(both: tuple[Backend, Backend]) -> None:
     with pytest.raises(BackendError, match="finite"):
         both[0].infer(np.full((1, 9, 4), np.nan, np.float32), np.zeros((1, 9, 8), np.float32))
+
+
+def test_what_pytorch_refuses_is_an_error_of_the_backend(monkeypatch: pytest.MonkeyPatch) -> None:
+    network = tiny_network()
+
+    def refuse(*inputs: object) -> None:
+        raise RuntimeError("out of memory")
+
+    monkeypatch.setattr(network, "forward", refuse)
+    with pytest.raises(BackendError, match="out of memory"):
+        NetworkBackend(network).infer(np.zeros((1, 9, 4), np.float32), np.zeros((1, 9, 8), np.float32))
