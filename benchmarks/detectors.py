@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mgca_filter.data.image_features import View, describe, match_views
 from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
-from mgca_filter.data.source import Image, check_folder, read_image
+from mgca_filter.data.source import Image, check_folder, match_views, read_image
 from mgca_filter.evaluation.metrics import POSE_STATISTICS, FloatArray
 from mgca_filter.evaluation.predict import evaluate_pair
 from mgca_filter.evaluation.registry import parse_method
-from mgca_filter.features import create_detector
+from mgca_filter.features import create_detector, describe
 from mgca_filter.tables import markdown_head, markdown_row
 from mgca_filter.training.worlds.photographs import PhotoFolder
 from mgca_filter.training.worlds.view_pairs import match_views as match_rendered
@@ -58,10 +57,15 @@ class ImageSet:
 
     def matched(self, detector: cv2.Feature2D) -> list[ScenePair]:
         """All pairs with what a detector finds and nearest neighbours make of it, no test applied."""
-        views = {name: _view(name, image, self.intrinsics[name], detector) for name, image in self.images.items()}
+        views = {
+            name: replace(describe(image, detector, name), K=self.intrinsics[name])
+            for name, image in self.images.items()
+        }
         return [
-            match_views(self.name, index, views[pair.image1], views[pair.image2], pair.R, pair.t)
-            for index, pair in enumerate(self.pairs)
+            match_views(
+                self.name, i, (pair.image1, pair.image2), (views[pair.image1], views[pair.image2]), pair.R, pair.t
+            )
+            for i, pair in enumerate(self.pairs)
         ]
 
 
@@ -106,11 +110,6 @@ def rendered(photos: Path, count: int, seed: int) -> ImageSet:
 
 def _cameras(pair: ScenePair) -> Sequence[tuple[str, Array, tuple[int, int]]]:
     return ((pair.image1, pair.K1, pair.image_size1), (pair.image2, pair.K2, pair.image_size2))
-
-
-def _view(name: str, image: Image, K: Array, detector: cv2.Feature2D) -> View:
-    features = describe(image, detector, name)
-    return View(name, features, features.points, K)
 
 
 def _rescaled(K: Array, size: tuple[int, int], now: tuple[int, ...]) -> Array:

@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mgca_filter.atomic_file import replaced_when_done
-from mgca_filter.data.image_features import FEATURE_SETTINGS, detect, match_features
-from mgca_filter.data.source import digest_files
+from mgca_filter.data.source import detect, digest_files
 from mgca_filter.evaluation.metrics import FAILURE_DEG
 from mgca_filter.evaluation.our_rows import runtime_source_digest
 from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
+from mgca_filter.features import FEATURE_SETTINGS, match_features
 from mgca_filter.geometry.epipolar import decompose_essential, pose_error_deg
 from mgca_filter.inputs.attributes import MatchAttributes
 from mgca_filter.inputs.pair import MatchPair
@@ -102,8 +102,8 @@ def _matched_arrays(path1: Path, path2: Path) -> dict[str, NDArray[Any]]:
     return {
         "points1": one.points[matches.index1],
         "points2": two.points[matches.index2],
-        "image1": np.array(one.size),
-        "image2": np.array(two.size),
+        "image1": np.array(one.image_size),
+        "image2": np.array(two.image_size),
         **{name: values for name, values in asdict(matches.attributes).items() if values is not None},
     }
 

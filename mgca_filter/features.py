@@ -1,19 +1,73 @@
-"""Detect, describe and match: from two images to keypoints, descriptors and putative matches."""
+"""Detect, match, attributes: from two images to their putative matches and all that is known of each."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .inputs.attributes import MatchAttributes, best_of_list, distance_ratio
+from .inputs.matches import read_matches
+
 DETECTORS = ("sift", "orb", "akaze")
 DETECTOR_MAX_SIDE_PX = 1200
 SIFT_FEATURE_COUNT = 2000
 SIFT_CONTRAST_THRESHOLD = 1e-5
+FEATURE_SETTINGS = f"sift {SIFT_FEATURE_COUNT}, revision 1, opencv {cv2.__version__}"
+"""Part of the digest of whatever is kept that was detected and matched here with the default detector."""
+
 # In a narrower strip OpenCV's detectors find nothing, and some of them fail.
 _NARROWEST_PX = 6
+
+
+@dataclass(frozen=True)
+class ImageFeatures:
+    """What is known of one image with N keypoints.
+
+    Attributes:
+        points: (N, 2) pixels, OpenCV's convention; free of distortion where ``K`` is known. A point is NaN where the
+            camera model gives none.
+        size, angle: (N,) diameters in pixels and orientations in degrees, or None.
+        descriptors: (N, D), or None.
+        K: (3, 3) intrinsics, or None.
+        image_size: (width, height) in pixels, or None.
+    """
+
+    points: NDArray[Any]
+    size: NDArray[Any] | None = None
+    angle: NDArray[Any] | None = None
+    descriptors: NDArray[Any] | None = None
+    K: NDArray[np.float64] | None = None
+    image_size: tuple[int, int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def take(self, rows: NDArray[np.intp]) -> ImageFeatures:
+        """The keypoints of the given rows (n,) alone."""
+        size, angle, descriptors = (
+            None if field is None else field[rows] for field in (self.size, self.angle, self.descriptors)
+        )
+        return replace(self, points=self.points[rows], size=size, angle=angle, descriptors=descriptors)
+
+
+@dataclass(frozen=True)
+class OneWayMatches:
+    """Nearest neighbour in image 2 of each of M keypoints of image 1, no test applied.
+
+    Attributes:
+        index1, index2: (M,) rows of the two images' features; ``index1`` is 0, 1, 2, ….
+        attributes: what the matcher and the keypoints know of each match.
+        mutual: bool (M,), nearest both ways.
+    """
+
+    index1: NDArray[np.intp]
+    index2: NDArray[np.intp]
+    attributes: MatchAttributes
+    mutual: NDArray[np.bool_]
 
 
 def create_detector(name: str = "sift", feature_count: int = SIFT_FEATURE_COUNT) -> cv2.Feature2D:
@@ -133,3 +187,93 @@ def match_descriptors(
     if norm is None:
         norm = cv2.NORM_HAMMING if descriptors1.dtype == np.uint8 else cv2.NORM_L2
     return tuple(tuple(row) for row in cv2.BFMatcher(norm).knnMatch(descriptors1, descriptors2, k=2))
+
+
+def describe(image: NDArray[Any], detector: cv2.Feature2D, name: str = "image") -> ImageFeatures:
+    """Features of an image, in its pixels; arguments and errors as :func:`detect_keypoints`."""
+    keypoints, descriptors = detect_keypoints(image, detector, name)
+    values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float64).reshape(-1, 4)
+    return ImageFeatures(
+        points=values[:, :2],
+        size=values[:, 2].astype(np.float32),
+        angle=values[:, 3].astype(np.float32),
+        descriptors=descriptors,
+        image_size=(image.shape[1], image.shape[0]),
+    )
+
+
+def match_features(features1: ImageFeatures, features2: ImageFeatures) -> OneWayMatches:
+    """The matches of two images as :func:`mgca_filter.match_images` finds them, and which of them are mutual.
+
+    Without keypoints on either side there are none. The ratio (M,) is NaN where image 2 has one keypoint only.
+
+    Raises:
+        ValueError: an image has no descriptors, or the two images' differ in dtype or length.
+    """
+    descriptors1, descriptors2 = _described(features1), _described(features2)
+    count1, count2 = len(features1), len(features2)
+    forth = read_matches(match_descriptors(descriptors1, descriptors2), count1, count2)
+    back = read_matches(match_descriptors(descriptors2, descriptors1), count2, count1)
+    ratio = np.full(len(forth), np.nan, dtype=np.float32) if forth.ratio is None else forth.ratio
+    shapes = keypoint_attributes(features1, features2, forth.index1, forth.index2)
+    mutual = np.zeros(0, dtype=bool) if len(forth) == 0 else back.index2[forth.index2] == forth.index1
+    return OneWayMatches(forth.index1, forth.index2, replace(shapes, ratio=ratio, best=forth.best), mutual)
+
+
+def keypoint_attributes(
+    features1: ImageFeatures, features2: ImageFeatures, index1: NDArray[np.intp], index2: NDArray[np.intp]
+) -> MatchAttributes:
+    """Size and angle of each match (M,) of keypoints ``index1``, ``index2`` (M,), where both images know them."""
+    known: dict[str, NDArray[Any]] = {}
+    for side, features, index in (("1", features1, index1), ("2", features2, index2)):
+        if features.size is None or features.angle is None:
+            return MatchAttributes()
+        known |= {f"size{side}": features.size[index], f"angle{side}": features.angle[index]}
+    return MatchAttributes(**known)
+
+
+def attributes_of_matches(
+    features1: ImageFeatures, features2: ImageFeatures, pairs: NDArray[np.intp]
+) -> MatchAttributes:
+    """What two images' features tell of matches that someone else found.
+
+    Args:
+        features1, features2: descriptors tell ratio and best of the list where both images have two or more; sizes
+            and angles stand where both images know them.
+        pairs: (M, 2) rows of the two images' features, M of 1 or more.
+    """
+    shapes = keypoint_attributes(features1, features2, pairs[:, 0], pairs[:, 1])
+    if features1.descriptors is None or features2.descriptors is None or min(len(features1), len(features2)) < 2:
+        return shapes
+    distance, nearest_other = descriptor_distances(features1.descriptors, features2.descriptors, pairs)
+    ratio, best = distance_ratio(distance, nearest_other), best_of_list(pairs[:, 1].astype(np.intp), distance)
+    return replace(shapes, ratio=ratio, best=best)
+
+
+def descriptor_distances(
+    descriptors1: NDArray[Any], descriptors2: NDArray[Any], pairs: NDArray[np.intp], block: int = 1024
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Euclidean distance (M,) of each match, and that (M,) to the nearest other descriptor of image 2.
+
+    Args:
+        descriptors1, descriptors2: (N1, D), (N2, D), N2 of 2 or more. pairs: (M, 2) indices.
+        block: matches at a time, to bound the memory.
+    """
+    all2 = descriptors2.astype(np.float32)
+    square2 = np.sum(all2 * all2, axis=1)
+    matched, other = np.empty(len(pairs)), np.empty(len(pairs))
+    for first in range(0, len(pairs), block):
+        rows = pairs[first : first + block].astype(np.intp)
+        query = descriptors1[rows[:, 0]].astype(np.float32)
+        squared = np.sum(query * query, axis=1)[:, None] + square2 - 2.0 * (query @ all2.T)  # (block, N2)
+        own = np.arange(len(rows)), rows[:, 1]
+        matched[first : first + block] = squared[own]
+        squared[own] = np.inf
+        other[first : first + block] = squared.min(axis=1)
+    return np.sqrt(np.maximum(matched, 0.0)), np.sqrt(np.maximum(other, 0.0))
+
+
+def _described(features: ImageFeatures) -> NDArray[Any]:
+    if features.descriptors is None:
+        raise ValueError("no matches, and no descriptors to find them with")
+    return features.descriptors

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from .fit.ranking import RankedMatches, match_order
 from .fit.robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
 from .fit.verdict import Verdict, count_distinct, judge
-from .inference import BACKENDS, shared_backend
+from .inference import BACKENDS, Backend, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_network_input
 from .inputs.attributes import Column, MatchAttributes
@@ -64,6 +64,15 @@ class MatchFilter:
         self.options = FilterOptions(threshold, keep_precision, confidence, method_name(method), max_iterations, seed)
         self.fit_options = RobustFitOptions.of(self.options)
         self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
+
+    @classmethod
+    def over(cls, backend: Backend, options: FilterOptions | None = None) -> MatchFilter:
+        """A filter over a backend that is open already, such as a network that is being trained."""
+        match_filter = cls.__new__(cls)
+        match_filter.options = FilterOptions() if options is None else options
+        match_filter.fit_options = RobustFitOptions.of(match_filter.options)
+        match_filter._backend = backend
+        return match_filter
 
     def filter(
         self,

@@ -1,7 +1,8 @@
 """Where pairs with a known pose come from: one interface, four formats, each pair read when it is asked for.
 
-``bundles`` are scene bundles, ``oanet`` HDF5 dumps, ``pair_lists`` text files of image pairs as SuperGlue has them,
-``colmap`` reconstructions with their images. The last two match their images by ``image_features``.
+``scene_bundle`` reads and writes scene bundles, ``bundles`` are their pairs; ``oanet_hdf5`` reads HDF5 dumps,
+``pair_lists`` text files of image pairs as SuperGlue has them, ``colmap`` reconstructions with their images. The last
+two match their images by :mod:`mgca_filter.features`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from pathlib import Path
 from ..errors import DatasetError
 from .bundles import open_bundles
 from .colmap import open_reconstruction
-from .oanet import open_dumps
+from .oanet_hdf5 import open_dumps
 from .pair_lists import open_pair_lists
 from .source import PairSource
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from ..errors import BundleError
-from .scene_bundle import SceneBundle, ScenePair
+from .scene_bundle import SceneBundle, ScenePair, bundle_files
 from .source import Image, check_pose, digest_files, read_image
 
 
@@ -61,7 +60,8 @@ def open_bundles(path: Path, images: Path | None = None) -> list[BundleSource]:
     Raises:
         BundleError: there is none, or one is broken.
     """
-    files = [path] if path.is_file() else sorted(path.glob("*.npz"))
-    if not files:
-        raise BundleError(f"{path}: no scene bundle (.npz) found")
-    return [BundleSource(file, digest_files([file]), len(SceneBundle(file)), images) for file in files]
+    sources = []
+    for file in bundle_files(path):
+        digest = digest_files([file])
+        sources.append(BundleSource(file, digest, len(_bundle(file, digest)), images))
+    return sources

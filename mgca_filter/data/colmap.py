@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from .image_features import FEATURE_SETTINGS, View, detect, match_views
+from ..features import FEATURE_SETTINGS, ImageFeatures
 from .scene_bundle import ScenePair
-from .source import Image, check_folder, check_pose, digest_files, read_image
+from .source import Image, check_folder, check_pose, detect, digest_files, match_views, read_image
 
 MIN_COVISIBLE_POINTS = 15
 """Reconstructed points that two images must share to make a pair."""
@@ -65,14 +65,16 @@ class ColmapSource:
         R = two.R @ one.R.T
         t = two.t - R @ one.t
         check_pose(R, t, f"{self.path}: {one.name} and {two.name}")
-        return match_views(self.scene, index, self.view(one), self.view(two), R, t)
+        return match_views(self.scene, index, (one.name, two.name), (self.view(one), self.view(two)), R, t)
 
-    def view(self, photo: _Photo) -> View:
+    def view(self, photo: _Photo) -> ImageFeatures:
         """A photograph's features, with their distortion removed."""
         features = detect(self.image_folder / photo.name)
-        if features.size != photo.size:
+        assert features.image_size is not None
+        if features.image_size != photo.size:
+            width, height = features.image_size
             raise DatasetError(
-                f"{self.image_folder / photo.name}: {features.size[0]} x {features.size[1]} px, "
+                f"{self.image_folder / photo.name}: {width} x {height} px, "
                 f"but its camera has {photo.size[0]} x {photo.size[1]} px"
             )
         K = photo.intrinsics()
@@ -80,7 +82,7 @@ class ColmapSource:
         if len(points):
             x = np.asarray(photo.camera().cam_from_img(points + HALF_PIXEL), dtype=np.float64)
             points = x @ K[:2, :2].T + K[:2, 2]
-        return View(photo.name, features, points, K)
+        return replace(features, points=points, K=K)
 
     def images(self, pair: ScenePair) -> tuple[Image, Image] | None:
         """Both photographs with their distortion removed."""

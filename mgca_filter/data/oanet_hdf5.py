@@ -6,8 +6,8 @@ the format that later papers of the family share).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from ..errors import DatasetError
 from ..inputs.attributes import MatchAttributes
+from .scene_bundle import ScenePair
+from .source import ROTATION_TOLERANCE, Image, digest_files, find_files
 
 GROUPS = ("xs", "ys", "Rs", "ts", "ratios", "mutuals", "cx1s", "cy1s", "cx2s", "cy2s", "f1s", "f2s")
-ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R Rᵀ − I that passes: dumps are written in float32 and less."""
+"""All that a dump has; ``ys``, the squared distances to the true geometry, follow from the rest and are not read."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,6 @@ class OanetPair:
     Attributes:
         index: of the pair in the file.
         correspondences: (N, 4) float64 on the normalised image planes.
-        distance_squared: (N,) float64, squared symmetric epipolar distance as the dump gives it (``ys``).
         R, t: (3, 3) and (3,) float64, ``X2 = R X1 + t``; the scale of ``t`` is unknown.
         ratio: (N,) float32, distance to the nearest over distance to the second nearest descriptor.
         mutual: (N,) bool, two-way nearest neighbours.
@@ -39,7 +39,6 @@ class OanetPair:
 
     index: int
     correspondences: NDArray[np.float64]
-    distance_squared: NDArray[np.float64]
     R: NDArray[np.float64]
     t: NDArray[np.float64]
     ratio: NDArray[np.float32]
@@ -72,9 +71,6 @@ class OanetFile:
     def __len__(self) -> int:
         return self._count
 
-    def __iter__(self) -> Iterator[OanetPair]:
-        return (self[index] for index in range(len(self)))
-
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_file": None}
 
@@ -98,7 +94,6 @@ class OanetFile:
         return OanetPair(
             index=index,
             correspondences=xs[0],
-            distance_squared=self._read("ys", index, count),
             R=self._rotation(index),
             t=self._translation(index),
             ratio=self._read("ratios", index, count).astype(np.float32),
@@ -190,3 +185,74 @@ def best_by_mutual(points2: NDArray[np.float64], mutual: NDArray[np.bool_]) -> N
     keypoint = keypoint.reshape(-1)
     decided = np.bincount(keypoint, weights=mutual) > 0
     return np.asarray(mutual | ~decided[keypoint])
+
+
+@dataclass(frozen=True)
+class OanetSource:
+    """The pairs of one dump; the scene is the file's name, since a dump doesn't say which scene a pair is of."""
+
+    path: Path
+    sha256: str
+    count: int
+
+    @property
+    def scene(self) -> str:
+        return self.path.stem
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, index: int) -> ScenePair:
+        pair = _dump(self.path, self.sha256)[index]
+        points1, points2 = _pixels(pair.correspondences[:, :2], pair.K1), _pixels(pair.correspondences[:, 2:], pair.K2)
+        return ScenePair(
+            scene=self.scene,
+            index=index,
+            image1=f"{index}, image 1",
+            image2=f"{index}, image 2",
+            points1=points1,
+            points2=points2,
+            K1=pair.K1,
+            K2=pair.K2,
+            image_size1=_smallest_size(points1, pair.K1),
+            image_size2=_smallest_size(points2, pair.K2),
+            R=pair.R,
+            t=pair.t,
+            attributes=pair.attributes(),
+            mutual=pair.mutual,
+        )
+
+    def images(self, pair: ScenePair) -> tuple[Image, Image] | None:
+        """None: a dump holds no images and doesn't name them."""
+        return None
+
+
+@lru_cache(maxsize=2)
+def _dump(path: Path, sha256: str) -> OanetFile:
+    return OanetFile(path)
+
+
+def _pixels(x: NDArray[np.float64], K: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(x * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]])
+
+
+def _smallest_size(points: NDArray[np.float64], K: NDArray[np.float64]) -> tuple[int, int]:
+    """(width, height) of the smallest image that is centred on the principal point and holds all points (N, 2).
+
+    Dumps do not tell the size; grid-based filters need one.
+    """
+    centre = K[:2, 2]
+    reach = np.abs(points - centre).max(axis=0, initial=0.0)
+    width, height = np.ceil(2.0 * np.maximum(centre, reach) + 1.0).astype(int)
+    return int(width), int(height)
+
+
+def open_dumps(path: Path, images: Path | None = None) -> list[OanetSource]:
+    """One source for each ``.hdf5`` or ``.h5`` of a folder, or for the one that ``path`` names.
+
+    Raises:
+        DatasetError: there is none, or one is of another layout.
+        ImportError: h5py is not installed.
+    """
+    files = find_files(path, (".hdf5", ".h5"), "HDF5 dump")
+    return [OanetSource(file, digest_files([file]), len(OanetFile(file))) for file in files]

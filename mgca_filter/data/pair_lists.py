@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
-from .image_features import FEATURE_SETTINGS, View, detect, match_views
+from ..features import FEATURE_SETTINGS
 from .scene_bundle import ScenePair
-from .source import Image, check_folder, check_intrinsics, check_pose, digest_files, find_files, read_image
+from .source import (
+    Image,
+    check_folder,
+    check_intrinsics,
+    check_pose,
+    detect,
+    digest_files,
+    find_files,
+    match_views,
+    read_image,
+)
 
 VALUES_PER_LINE = 38
 """Two names, two rotation flags, K0 (9), K1 (9), T_0to1 (16)."""
@@ -53,11 +63,12 @@ class PairListSource:
         views, turns = [], []
         for name, count, K in zip(entry.names, entry.quarter_turns, entry.intrinsics):
             features = detect(self.image_folder / name, count)
-            K, turn = turn_camera(K, features.size, count)
-            views.append(View(name, features, features.points, K))
+            assert features.image_size is not None
+            K, turn = turn_camera(K, features.image_size, count)
+            views.append(replace(features, K=K))
             turns.append(turn)
         R, t = turns[1] @ entry.R @ turns[0].T, turns[1] @ entry.t
-        return match_views(self.scene, index, views[0], views[1], R, t)
+        return match_views(self.scene, index, entry.names, (views[0], views[1]), R, t)
 
     def images(self, pair: ScenePair) -> tuple[Image, Image] | None:
         """Both photographs, turned as the flags say."""

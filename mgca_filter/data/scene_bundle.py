@@ -1,7 +1,8 @@
-"""Scene bundles: keypoints, one-way matches and true poses of one photographed scene in an ``.npz``."""
+"""Scene bundles, read and written: keypoints, one-way matches and true poses of a photographed scene in an ``.npz``."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..atomic_file import replaced_when_done
 from ..errors import BundleError
+from ..features import ImageFeatures, OneWayMatches
 from ..geometry.cameras import normalize_points
 from ..geometry.epipolar import essential_from_pose
 from ..inputs.attributes import MatchAttributes
@@ -19,6 +22,9 @@ _FIELDS = (
     *("keypoint_offset", "keypoint_xy", "keypoint_size", "keypoint_angle"),
     *("pair", "match_offset", "match_index", "match_ratio", "match_mutual", "match_best", "covisible"),
 )
+LABEL_FIELD = "match_label"
+"""Optional field: labels (ΣM,) int8 of all matches, for bundles that know them better than poses tell."""
+ANGLE_UNITS = 256  # of a full turn, to fit a byte
 
 
 @dataclass(frozen=True)
@@ -26,7 +32,8 @@ class ScenePair:
     """Two images of a scene, their raw one-way matches and the true relative pose (X2 = R X1 + t).
 
     ``points1``, ``points2`` are undistorted pixels (M, 2) under ``K1``, ``K2``; ``mutual`` (M,) marks two-way
-    nearest neighbours; ``t`` (3,) has the scene's unknown scale.
+    nearest neighbours; ``t`` (3,) has the scene's unknown scale; ``labels`` (M,) int8 (1 = right, 0 = wrong, −1 = left
+    out) where the data know them better than the pose tells, else None.
     """
 
     scene: str
@@ -43,6 +50,7 @@ class ScenePair:
     t: NDArray[np.float64]
     attributes: MatchAttributes
     mutual: NDArray[np.bool_]
+    labels: NDArray[np.int8] | None = None
 
     @property
     def name(self) -> str:
@@ -75,7 +83,7 @@ class SceneBundle:
                 missing = [field for field in _FIELDS if field not in data.files]
                 if missing:
                     raise BundleError(f"{self.path}: not a scene bundle, fields missing: {', '.join(missing)}")
-                self._data = {field: data[field] for field in _FIELDS}
+                self._data = {field: data[field] for field in (*_FIELDS, LABEL_FIELD) if field in data.files}
         except BundleError:
             raise
         except Exception as error:  # zipfile, zlib, numpy and the system each have their own
@@ -115,9 +123,10 @@ class SceneBundle:
             "match_ratio": (matches,),
             "match_mutual": ((matches + 7) // 8,),
             "match_best": ((matches + 7) // 8,),
+            LABEL_FIELD: (matches,),
         }
         for field, shape in lengths.items():
-            if d[field].shape != shape:
+            if field in d and d[field].shape != shape:
                 raise BundleError(f"{self.path}: {field} has the shape {d[field].shape}, its offsets promise {shape}")
         for field in ("match_mutual", "match_best"):
             if d[field].dtype != np.uint8:
@@ -133,6 +142,23 @@ class SceneBundle:
         eye = d["R"] @ np.transpose(d["R"], (0, 2, 1))
         if len(eye) and (np.abs(eye - np.eye(3)).max() > 1e-4 or np.linalg.det(d["R"]).min() < 0):
             raise BundleError(f"{self.path}: R holds a matrix that is not a rotation")
+
+    def check_training_pairs(self) -> None:
+        """Refuse pairs that have no epipolar geometry or share nothing: training would learn from them.
+
+        Raises:
+            BundleError: two images of a pair have the same centre, or ``covisible`` says that they do not overlap.
+        """
+        pair, R, t = (self._data[field] for field in ("pair", "R", "t"))
+        centres = -np.einsum("nji,nj->ni", R, t)
+        baseline = np.linalg.norm(centres[pair[:, 0]] - centres[pair[:, 1]], axis=1)
+        one_centre = baseline <= 1e-9 * (1.0 + np.linalg.norm(centres, axis=1).max(initial=0.0))
+        for field, wrong, meaning in (
+            ("t", one_centre, "both images have one centre"),
+            ("covisible", self._data["covisible"] == 0, "the images share nothing"),
+        ):
+            if wrong.any():
+                raise BundleError(f"{self.path}: {field}: pair {int(np.flatnonzero(wrong)[0])}: {meaning}")
 
     def match_counts(self) -> NDArray[np.int64]:
         """Number of raw matches of each pair (P,)."""
@@ -154,7 +180,7 @@ class SceneBundle:
         k2 = start_j + d["match_index"][rows].astype(np.int64)
         if count and (k1[-1] >= d["keypoint_offset"][i + 1] or k2.max() >= d["keypoint_offset"][j + 1]):
             raise BundleError(f"{self.path}: match_index of pair {index} names a keypoint that is not there")
-        size, angle, degrees = d["keypoint_size"], d["keypoint_angle"], np.float32(360.0 / 256.0)
+        size, angle, degrees = d["keypoint_size"], d["keypoint_angle"], np.float32(360.0 / ANGLE_UNITS)
         R = d["R"][j] @ d["R"][i].T
         return ScenePair(
             scene=self.scene,
@@ -178,6 +204,7 @@ class SceneBundle:
                 angle2=angle[k2] * degrees,
             ),
             mutual=d["match_mutual"][rows],
+            labels=np.asarray(d[LABEL_FIELD][rows], dtype=np.int8) if LABEL_FIELD in d else None,
         )
 
 
@@ -187,8 +214,93 @@ def load_scene_bundles(folder: str | Path) -> list[SceneBundle]:
     Raises:
         BundleError: the path holds no ``.npz``, or one of them is broken.
     """
-    folder = Path(folder)
-    paths = [folder] if folder.is_file() else sorted(folder.glob("*.npz"))
-    if not paths:
-        raise BundleError(f"{folder}: no scene bundle (.npz) found")
-    return [SceneBundle(path) for path in paths]
+    return [SceneBundle(path) for path in bundle_files(Path(folder))]
+
+
+def bundle_files(path: Path) -> list[Path]:
+    """The bundle that ``path`` names, or those of a folder in the order of their names.
+
+    Raises:
+        BundleError: there is none.
+    """
+    files = [path] if path.is_file() else sorted(path.glob("*.npz"))
+    if not files:
+        raise BundleError(f"{path}: no scene bundle (.npz) found")
+    return files
+
+
+@dataclass(frozen=True)
+class BundleImage:
+    """A photograph with its pose, world → camera; its features hold camera, size and keypoints, free of distortion."""
+
+    name: str
+    features: ImageFeatures
+    R: NDArray[np.float64]
+    t: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BundlePair:
+    """Matches from image ``first`` to image ``second``; ``covisible`` = shared 3-D points, −1 = not known."""
+
+    first: int
+    second: int
+    matches: OneWayMatches
+    covisible: int
+    labels: NDArray[np.int8] | None = None
+
+
+def write_bundle(path: Path, images: Sequence[BundleImage], pairs: Sequence[BundlePair]) -> None:
+    """Write a bundle; a crash in the middle leaves no broken file behind.
+
+    Raises:
+        ValueError: there is no pair, an image holds more keypoints than 16 bits count, or lacks its camera, its size or
+            what is known of its keypoints, or a match has no ratio.
+    """
+    if not pairs:
+        raise ValueError(f"{path}: no pair to write")
+    features = [image.features for image in images]
+    if max(map(len, features)) > np.iinfo(np.uint16).max:
+        raise ValueError(f"{path}: more than {np.iinfo(np.uint16).max} keypoints in an image")
+    for image in images:
+        missing = [name for name in ("K", "image_size", "size", "angle") if getattr(image.features, name) is None]
+        if missing:
+            raise ValueError(f"{path}: {image.name}: not known: {', '.join(missing)}")
+    angle = np.concatenate([image.angle for image in features]).astype(np.float64)
+    size = np.concatenate([image.size for image in features])
+    ratio = np.concatenate([pair.matches.attributes.ratio for pair in pairs])
+    if not np.isfinite(ratio).all():
+        raise ValueError(f"{path}: a match has no ratio: its second image has fewer than two keypoints")
+    fields: dict[str, NDArray[np.generic]] = {
+        "image_name": np.array([image.name for image in images]),
+        "image_size": np.array([image.image_size for image in features], dtype=np.int32),
+        "K": np.array([image.K for image in features], dtype=np.float64),
+        "R": np.array([image.R for image in images], dtype=np.float64),
+        "t": np.array([image.t for image in images], dtype=np.float64),
+        "keypoint_offset": _offsets([len(image) for image in features]),
+        "keypoint_xy": np.concatenate([image.points for image in features]).astype(np.float32),
+        "keypoint_size": size.astype(np.float16),
+        "keypoint_angle": (np.round(angle * (ANGLE_UNITS / 360.0)).astype(np.int64) % ANGLE_UNITS).astype(np.uint8),
+        "pair": np.array([(pair.first, pair.second) for pair in pairs], dtype=np.int32),
+        "match_offset": _offsets([len(pair.matches.index2) for pair in pairs]),
+        "match_index": np.concatenate([pair.matches.index2 for pair in pairs]).astype(np.uint16),
+        "match_ratio": np.round(255.0 * ratio).astype(np.uint8),
+        "match_mutual": np.packbits(np.concatenate([pair.matches.mutual for pair in pairs])),
+        "match_best": np.packbits(np.concatenate([_best(pair.matches) for pair in pairs])),
+        "covisible": np.array([pair.covisible for pair in pairs], dtype=np.int32),
+    }
+    labels = [pair.labels for pair in pairs if pair.labels is not None]
+    if len(labels) == len(pairs):
+        fields[LABEL_FIELD] = np.concatenate(labels)
+    with replaced_when_done(path) as temporary, temporary.open("wb") as file:
+        np.savez_compressed(file, **fields)  # type: ignore[arg-type]
+
+
+def _best(matches: OneWayMatches) -> NDArray[np.bool_]:
+    """Best-of-list flags (M,); where all distances are equal no match is worse than another."""
+    best = matches.attributes.best
+    return np.ones(len(matches.index2), dtype=bool) if best is None else best
+
+
+def _offsets(counts: Sequence[int]) -> NDArray[np.generic]:
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DatasetError
+from ..features import ImageFeatures, create_detector, describe, match_features
 from .scene_bundle import ScenePair
 
 ROTATION_TOLERANCE = 1e-3
@@ -111,3 +113,54 @@ def read_image(path: Path) -> Image:
     if image is None:
         raise DatasetError(f"{path}: not an image that OpenCV can read")
     return np.asarray(image, dtype=np.uint8)
+
+
+@lru_cache(maxsize=128)
+def detect(path: Path, quarter_turns: int = 0) -> ImageFeatures:
+    """Features of an image file turned counter-clockwise by ``quarter_turns`` · 90°; kept for the latest 128 images.
+
+    They are those that :func:`mgca_filter.match_images` detects, in pixels of the stored image.
+
+    Raises:
+        DatasetError: the image is missing or cannot be read.
+    """
+    return describe(np.ascontiguousarray(np.rot90(read_image(path), quarter_turns)), create_detector(), str(path))
+
+
+def match_views(
+    scene: str,
+    index: int,
+    names: tuple[str, str],
+    views: tuple[ImageFeatures, ImageFeatures],
+    R: NDArray[np.float64],
+    t: NDArray[np.float64],
+) -> ScenePair:
+    """The pair of two images with pose ``X2 = R X1 + t``, whose features hold camera and size.
+
+    Keypoints without undistorted place are left out before matching.
+    """
+    view1, view2 = (view.take(np.flatnonzero(np.isfinite(view.points).all(axis=1))) for view in views)
+    matches = match_features(view1, view2)
+    (K1, size1), (K2, size2) = (_camera(name, view) for name, view in zip(names, views))
+    return ScenePair(
+        scene=scene,
+        index=index,
+        image1=names[0],
+        image2=names[1],
+        points1=view1.points[matches.index1],
+        points2=view2.points[matches.index2],
+        K1=K1,
+        K2=K2,
+        image_size1=size1,
+        image_size2=size2,
+        R=R,
+        t=t,
+        attributes=matches.attributes,
+        mutual=matches.mutual,
+    )
+
+
+def _camera(name: str, view: ImageFeatures) -> tuple[NDArray[np.float64], tuple[int, int]]:
+    if view.K is None or view.image_size is None:
+        raise ValueError(f"{name}: its camera and size must be known")
+    return view.K, view.image_size

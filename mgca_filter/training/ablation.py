@@ -1,7 +1,8 @@
 """``python -m mgca_filter.training.ablation --data FOLDER --steps N --out FOLDER``: the paper's ablation, and ours.
 
-Every row has the same budget, seeds and data order. A row that was cut off goes on where it stopped; one that is done
-is not done again. ``ablation.md`` and ``ablation.json`` are written anew after each row.
+A row is a training config changed in one thing, or a stage of the paper's build-up. Every row has the same budget,
+seeds and data order. A row that was cut off goes on where it stopped; one that is done is not done again.
+``ablation.md`` and ``ablation.json`` are written anew after each row.
 """
 
 from __future__ import annotations
@@ -10,21 +11,21 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from datetime import timedelta
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 from ..atomic_file import replaced_when_done
 from ..data.scene_bundle import ScenePair, load_scene_bundles
 from ..errors import MgcaFilterError
 from ..network.weights import count_parameters
-from .ablation_rows import ROWS, Row, row_phases
-from .config import ConfigError, TrainingConfig, load_config
+from ..tables import render_table
+from .config import ConfigError, SourceConfig, TrainingConfig, load_config
 from .datasets import TrainingDataset
 from .loop import WEIGHTS, DivergedError, Trainer
 from .sources import open_sources
@@ -33,6 +34,83 @@ from .validation import quick_validation, select_pairs
 CONFIGS = Path(__file__).parent / "configs"
 RESULT = "result.json"
 COLUMNS = ("fit_mAP@5", "fit_mAP@20", "fit_AUC@5", "essential_mAP@20", "precision", "recall", "F")
+
+
+RENDERED_SHARE = 0.25
+PRETRAINING_SHARE = 0.25
+
+_ONE_STAGE: Mapping[str, Any] = {"stages": 1, "csmgc": False, "final_consensus": False}
+_PLAIN_STAGES: Mapping[str, Any] = {"csmgc": False, "final_consensus": False}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row.
+
+    Attributes:
+        name: as the table has it.
+        network: changes to the full network.
+        rendered: a quarter of the pairs are rendered worlds.
+        pretrained: a quarter of the steps are spent on image-free pairs first; the budget stays the same.
+    """
+
+    name: str
+    network: Mapping[str, Any] = field(default_factory=dict)
+    rendered: bool = False
+    pretrained: bool = False
+
+    @property
+    def slug(self) -> str:
+        """The name as a folder's name."""
+        return "".join(c if c.isalnum() else "_" for c in self.name)
+
+
+ROWS = (
+    # The paper's table, from the bottom up.
+    Row("baseline", {**_ONE_STAGE, "cga": False}),
+    Row("CGA", _ONE_STAGE),
+    Row("iterations", {**_PLAIN_STAGES, "cga": False}),
+    Row("iterations + CGA", _PLAIN_STAGES),
+    Row("iterations + CSMGC", {"cga": False}),
+    Row("full"),
+    # The full network with one thing changed.
+    Row("point attention", {"attention": "point"}),
+    Row("no positional term", {"positional": False}),
+    Row("no pooled branches", {"pooled_branches": False}),
+    Row("no squeeze-excitation", {"squeeze_excitation": False}),
+    Row("no final consensus", {"final_consensus": False}),
+    Row("k = 3", {"neighbours": 3}),
+    Row("k = 9", {"neighbours": 9}),
+    Row("no side information", {"attributes": False}),
+    # Other data.
+    Row("rendered worlds", rendered=True),
+    Row("synthetic pre-training", pretrained=True),
+)
+
+
+def row_phases(row: Row, base: TrainingConfig, steps: int, seed: int, rendered: str) -> list[TrainingConfig]:
+    """The runs of a row, one after the other, each started from the last one's weights.
+
+    Args:
+        base: the full network, its data and schedule. steps: budget of the row.
+        rendered: path of rendered worlds, from the data folder.
+    """
+    config = replace(base, name=row.name, seed=seed, network=replace(base.network, **row.network))
+    if row.rendered:
+        total = sum(source.weight for source in base.sources)
+        share = total * RENDERED_SHARE / (1.0 - RENDERED_SHARE)
+        config = replace(config, sources=(*base.sources, SourceConfig("bundles", rendered, share)))
+    if not row.pretrained:
+        return [_with_steps(config, steps)]
+    first = max(1, round(PRETRAINING_SHARE * steps))
+    synthetic = replace(config, sources=(SourceConfig("synthetic"),), scenes=(), tuning_scenes=(), validation=())
+    return [_with_steps(synthetic, first), _with_steps(config, max(1, steps - first))]
+
+
+def _with_steps(config: TrainingConfig, steps: int) -> TrainingConfig:
+    """The same schedule over fewer steps: a short run must not be all warm-up."""
+    warmup = min(config.schedule.warmup_steps, steps // 10)
+    return replace(config, schedule=replace(config.schedule, steps=steps, warmup_steps=warmup))
 
 
 @dataclass(frozen=True)
@@ -99,22 +177,21 @@ class Ablation:
         }
         text = json.dumps({"command": command, "budget": budget, "rows": list(rows)}, indent=1)
         (self.out / "ablation.json").write_text(text, encoding="utf-8")
+        several = len(self.seeds) > 1
+        cells = [
+            [row["row"], f"{row['parameters'] / 1e6:.2f} M"]
+            + [f"{row[name]:.1f}" + (f" ± {row['spread'][name] / 2:.1f}" if several else "") for name in COLUMNS]
+            for row in rows
+        ]
         lines = [
             f"`{command}`",
             "",
             f"{budget['samples']} samples a row ({self.steps} steps of {self.base.sampling.batch_size}), "
             f"seeds {', '.join(map(str, self.seeds))}, {len(self.pairs)} validation pairs; averaged over pairs"
-            + (" and seeds, ± half the range." if len(self.seeds) > 1 else "."),
+            + (" and seeds, ± half the range." if several else "."),
             "",
-            "| row | parameters | " + " | ".join(name.replace("_", " ") for name in COLUMNS) + " |",
-            "|---|---:|" + "---:|" * len(COLUMNS),
+            render_table(["row", "parameters", *(name.replace("_", " ") for name in COLUMNS)], cells),
         ]
-        for row in rows:
-            cells = [
-                f"{row[name]:.1f}" + (f" ± {row['spread'][name] / 2:.1f}" if len(self.seeds) > 1 else "")
-                for name in COLUMNS
-            ]
-            lines.append(f"| {row['row']} | {row['parameters'] / 1e6:.2f} M | " + " | ".join(cells) + " |")
         (self.out / "ablation.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -174,13 +251,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         ablation, rows = prepare(options)
         done: list[dict[str, Any]] = []
-        for number, row in enumerate(rows, 1):
-            start = time.perf_counter()
-            done.append(ablation.run_row(row))
-            ablation.write(done, command)
-            seconds = time.perf_counter() - start
-            left = timedelta(seconds=round(seconds * (len(rows) - number)))
-            print(f"{row.name}: {seconds:.0f} s; {len(rows) - number} rows left, about {left} at this pace")
+        with tqdm(rows, unit="row") as progress:
+            for row in progress:
+                progress.set_postfix_str(row.name)
+                done.append(ablation.run_row(row))
+                ablation.write(done, command)
     except (ConfigError, MgcaFilterError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..inputs.attributes import Column
+
 FloatArray = NDArray[np.float64]
 
 
@@ -81,13 +83,14 @@ def transform_attributes(
 ) -> NDArray[np.float32]:
     """Encoded attributes (N, 8) after both images moved with Jacobians (N, 2, 2); angle1 (N,) in radians."""
     out = attributes.copy()
-    known = attributes[:, 7] > 0
-    angle2 = angle1 + np.arctan2(attributes[:, 4], attributes[:, 3])
+    known = attributes[:, Column.SHAPE_KNOWN] > 0
+    angle2 = angle1 + np.arctan2(attributes[:, Column.SIN_TURN], attributes[:, Column.COS_TURN])
     new1, new2 = (_turned(J, angle) for J, angle in ((J1, angle1), (J2, angle2)))
     area1, area2 = (np.abs(np.linalg.det(J)) for J in (J1, J2))
-    out[:, 2] = np.where(known, attributes[:, 2] + 0.5 * np.log2(area2 / area1), 0.0)
-    out[:, 3] = np.where(known, np.cos(new2 - new1), 0.0)
-    out[:, 4] = np.where(known, np.sin(new2 - new1), 0.0)
+    log2_size = attributes[:, Column.LOG2_SIZE] + 0.5 * np.log2(area2 / area1)
+    out[:, Column.LOG2_SIZE] = np.where(known, log2_size, 0.0)
+    out[:, Column.COS_TURN] = np.where(known, np.cos(new2 - new1), 0.0)
+    out[:, Column.SIN_TURN] = np.where(known, np.sin(new2 - new1), 0.0)
     return out
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ..data.bundle_writer import BundleImage, BundlePair, write_bundle
 from ..data.colmap import ColmapSource, observed_points, open_reconstruction
-from ..data.image_features import View
+from ..data.scene_bundle import BundleImage, BundlePair, write_bundle
 from ..errors import DatasetError
-from .sift import SiftFeatures, match_one_way
+from ..features import ImageFeatures, match_features
 
 
 def choose_pairs(
@@ -63,7 +62,7 @@ def build_bundle(
     features = {index: _features(source, index) for index in tqdm(used, unit="image")}
     place = {index: number for number, index in enumerate(used)}
     rows = [
-        BundlePair(place[i], place[j], match_one_way(features[i], features[j]), count)
+        BundlePair(place[i], place[j], match_features(features[i], features[j]), count)
         for i, j, count in tqdm(pairs, unit="pair")
         if min(len(features[i]), len(features[j])) >= 2
     ]
@@ -73,19 +72,15 @@ def build_bundle(
     return len(rows)
 
 
-def _features(source: ColmapSource, index: int) -> SiftFeatures:
+def _features(source: ColmapSource, index: int) -> ImageFeatures:
     """Keypoints of an image at undistorted pixels; those whose distortion cannot be removed are left out."""
-    view: View = source.view(source.photos[index])
-    rows = np.flatnonzero(np.isfinite(view.points).all(axis=1))
-    found = view.features
-    descriptors = np.asarray(found.descriptors, dtype=np.float32).reshape(len(view.points), -1)
-    return SiftFeatures(view.points[rows], found.diameter[rows], found.angle[rows], descriptors[rows])
+    view = source.view(source.photos[index])
+    return view.take(np.flatnonzero(np.isfinite(view.points).all(axis=1)))
 
 
-def _bundle_image(source: ColmapSource, index: int, features: SiftFeatures) -> BundleImage:
+def _bundle_image(source: ColmapSource, index: int, features: ImageFeatures) -> BundleImage:
     photo = source.photos[index]
-    camera = (photo.size, photo.intrinsics(), photo.R, photo.t)
-    return BundleImage(photo.name, *camera, features.points, features.size, features.angle)
+    return BundleImage(photo.name, features, photo.R, photo.t)
 
 
 def parse_arguments(arguments: Sequence[str] | None = None) -> argparse.Namespace:

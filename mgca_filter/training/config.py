@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin
+
+import dacite
 
 from ..network import NetworkConfig
 from .augmentation import AugmentationConfig
@@ -15,6 +18,8 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+T = TypeVar("T")
 
 
 class ConfigError(ValueError):
@@ -115,7 +120,7 @@ class TrainingConfig:
         return asdict(self)
 
 
-TABLES = {"sampling": SamplingConfig, "augmentation": AugmentationConfig, "schedule": ScheduleConfig}
+TABLES: dict[str, type] = {"sampling": SamplingConfig, "augmentation": AugmentationConfig, "schedule": ScheduleConfig}
 
 
 def load_config(path: str | Path) -> TrainingConfig:
@@ -138,58 +143,73 @@ def config_from_dict(values: dict[str, Any], where: str) -> TrainingConfig:
     Raises:
         ConfigError: a key or value does not fit; the message starts with ``where`` and the key.
     """
-    values = dict(values)
-    for name in ("network", *TABLES):
-        if not isinstance(values.get(name, {}), dict):
-            raise ConfigError(f"{where}: {name}: expected a table, got {values[name]!r}")
-    entries = values.pop("sources", [{}])
-    if not isinstance(entries, (list, tuple)) or not entries or not all(isinstance(e, dict) for e in entries):
+    entries = values.get("sources", [{}])
+    if not isinstance(entries, (list, tuple)) or not entries:
         raise ConfigError(f"{where}: sources: expected a list of tables, got {entries!r}")
+    tables: dict[str, Any] = {name: _read(kind, values.get(name, {}), where, name) for name, kind in TABLES.items()}
+    sources = tuple(_read(SourceConfig, entry, where, f"sources[{i}]") for i, entry in enumerate(entries))
+    network = _network(values.get("network", {}), where)
+    return _read(TrainingConfig, {**values, **tables, "sources": sources, "network": network}, where)
+
+
+def _network(values: Any, where: str) -> NetworkConfig:
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: network: expected a table, got {values!r}")
     try:
-        network = NetworkConfig.from_dict(values.pop("network", {}))
+        return NetworkConfig.from_dict(values)
     except ValueError as error:
         raise ConfigError(f"{where}: network: {error}") from error
-    tables = {name: _table(where, name, kind, values.pop(name, {})) for name, kind in TABLES.items()}
-    sources = tuple(_table(where, f"sources[{i}]", SourceConfig, entry) for i, entry in enumerate(entries))
-    rest = _checked(where, "", TrainingConfig, values)
-    if "name" not in rest:
-        raise ConfigError(f"{where}: name: missing")
-    return TrainingConfig(**rest, **tables, network=network, sources=sources)
 
 
-def _table(where: str, name: str, kind: type, values: dict[str, Any]) -> Any:
-    checked = _checked(where, name, kind, values)
+def _read(kind: type[T], values: Any, where: str, table: str = "") -> T:
+    """The dataclass ``kind`` from a table of the file ``where``; ``table`` is its name, "" = the file itself."""
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where}: {table}: expected a table, got {values!r}")
+    prefix = f"{where}: {table}." if table else f"{where}: "
     try:
-        return kind(**checked)
-    except ValueError as error:
-        raise ConfigError(f"{where}: {name}: {error}") from error
+        return dacite.from_dict(kind, values, _STRICT)
+    except dacite.UnexpectedDataError as error:
+        raise ConfigError(f"{prefix}{sorted(error.keys)[0]}: unknown key") from error
+    except dacite.MissingValueError as error:
+        raise ConfigError(f"{prefix}{error.field_path}: missing") from error
+    except dacite.WrongTypeError as error:
+        expected = _describe(error.field_type)
+        raise ConfigError(f"{prefix}{error.field_path}: expected {expected}, got {error.value!r}") from error
+    except ValueError as error:  # a range that the dataclass itself checks
+        raise ConfigError(f"{where}: {table}: {error}") from error
 
 
-def _checked(path: str, table: str, kind: type, values: dict[str, Any]) -> dict[str, Any]:
-    """Values whose keys and types are those of the dataclass ``kind``; lists become tuples."""
-    hints = get_type_hints(kind)
-    checked = {}
-    for key, value in values.items():
-        where = f"{table}.{key}" if table else key
-        if key not in hints:
-            raise ConfigError(f"{path}: {where}: unknown key")
-        hint = hints[key]
-        if get_origin(hint) is Literal:
-            if value not in get_args(hint):
-                raise ConfigError(f"{path}: {where}: expected one of {', '.join(get_args(hint))}, got {value!r}")
-            checked[key] = value
-        elif get_origin(hint) is tuple:
-            if not isinstance(value, (list, tuple)):
-                raise ConfigError(f"{path}: {where}: expected a list, got {value!r}")
-            checked[key] = tuple(_scalar(path, where, get_args(hint)[0], item) for item in value)
-        else:
-            checked[key] = _scalar(path, where, hint, value)
-    return checked
+def _describe(kind: Any) -> str:
+    """A type in the words of a config file."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    return f"a list of {get_args(kind)[0].__name__}" if get_origin(kind) is tuple else str(kind.__name__)
 
 
-def _scalar(path: str, where: str, kind: type, value: Any) -> Any:
-    if kind is float and type(value) is int:
-        return float(value)
-    if type(value) is not kind:
-        raise ConfigError(f"{path}: {where}: expected {kind.__name__}, got {value!r}")
-    return value
+def _number(kind: type) -> Callable[[Any], Any]:
+    """Lets whole numbers pass as float, and no bool as a number, which Python would."""
+
+    def read(value: Any) -> Any:
+        if isinstance(value, bool):
+            raise dacite.WrongTypeError(kind, value)
+        return float(value) if kind is float and isinstance(value, int) else value
+
+    return read
+
+
+def _list(kind: Any) -> Callable[[Any], Any]:
+    """Lists become tuples; text is no list of letters."""
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, (list, tuple)):
+            raise dacite.WrongTypeError(kind, value)
+        return tuple(value)
+
+    return read
+
+
+_STRICT = dacite.Config(
+    strict=True,
+    type_hooks={kind: _number(kind) for kind in (int, float)}
+    | {kind: _list(kind) for kind in (tuple[int, ...], tuple[float, ...], tuple[str, ...])},
+)

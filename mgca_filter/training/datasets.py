@@ -79,13 +79,10 @@ class TrainingDataset(Dataset[dict[str, Tensor]]):
         samples = [build_sample(draw, count, self.augmentation) for draw in batch[self.rank :: self.world]]
         return {name: torch.from_numpy(np.stack([s[name] for s in samples])) for name in samples[0]}
 
-    def draw(self, seed: tuple[int, ...]) -> Draw:
-        """One sample's pair and kind of input."""
-        return draw_sample(self.source, self.sampling, seed)
-
     def _draw_pool(self, pool: int) -> tuple[list[Draw], NDArray[np.intp]]:
         """All samples of a pool of batches, short ones first, and the order of its batches."""
         batches = self.sampling.pool_batches
-        draws = [self.draw((self.seed, pool, 0, i)) for i in range(batches * self.sampling.batch_size)]
+        seeds = [(self.seed, pool, 0, i) for i in range(batches * self.sampling.batch_size)]
+        draws = [draw_sample(self.source, self.sampling, seed) for seed in seeds]
         draws.sort(key=lambda draw: len(draw.rows))
         return draws, np.random.default_rng([self.seed, pool, 1]).permutation(batches)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from copy import deepcopy
-from datetime import timedelta
 from pathlib import Path
 
 import torch
@@ -123,15 +122,12 @@ class Trainer:
             save_network(self.average, temporary, {"name": self.config.name, "steps": str(self.step)})
 
     def _log(self, figures: dict[str, float], seconds: float, progress: tqdm[None]) -> None:
-        """Write a row, and say how fast the run is and how long it will take."""
+        """Write a row, and say beside the bar how the run goes."""
         if self.directory is None:
             return
         speed = LOG_EVERY * self.config.sampling.batch_size / seconds
         self.directory.log(self.step, {**figures, "samples_per_s": speed})
-        left = timedelta(seconds=round(seconds / LOG_EVERY * (self.config.schedule.steps - self.step)))
-        progress.set_postfix_str(
-            f"loss {figures['loss']:.3f}, recall {figures['recall']:.2f}, {speed:.0f} samples/s, {left} left"
-        )
+        progress.set_postfix_str(f"loss {figures['loss']:.3f}, recall {figures['recall']:.2f}, {speed:.0f} samples/s")
 
     def _validate(self) -> None:
         if self.directory is not None and self.validate is not None:

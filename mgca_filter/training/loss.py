@@ -9,7 +9,7 @@ from torch.nn import functional as F
 from ..network import NetworkOutput
 from ..network.eight_point import symmetric_epipolar_distance_squared
 from ..network.essential_refinement import refine_essential
-from .labels import NEGATIVE, POSITIVE
+from .pairs import NEGATIVE, POSITIVE
 
 GEOMETRIC_CLAMP = 0.1
 REFINED_DISTANCE = 1e-4  # squared: about ten pixels, half a degree

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from ..data.bundle_writer import BundleImage, BundlePair, write_bundle
+from ..data.scene_bundle import BundleImage, BundlePair, write_bundle
 from .worlds.photographs import PhotoError, PhotoFolder
 from .worlds.view_pairs import bundle_image, bundle_pairs
 from .worlds.views import draw_views

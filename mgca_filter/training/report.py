@@ -19,21 +19,23 @@ from tqdm import tqdm
 
 from ..data.scene_bundle import SceneBundle, ScenePair, load_scene_bundles
 from ..errors import BundleError, MgcaFilterError
-from ..network import MGCANet, load_network
-from .input_kinds import INPUT_KINDS
+from ..inference.network_backend import NetworkBackend
+from ..match_filter import MatchFilter
+from ..network import load_network
+from ..tables import render_table
 from .sampling import SamplingConfig
-from .validation import PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
+from .validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, select_pairs, summarize
 
 THRESHOLDS = np.arange(-4.0, 4.01, 0.5)
 Summary = dict[str, dict[str, dict[str, Any]]]  # scenes → kind of input → figures by name
 Figures = dict[str, dict[str, list[PairFigures]]]  # scenes → kind of input → pairs
 
 
-def evaluate(network: MGCANet, groups: Mapping[str, Sequence[ScenePair]]) -> Figures:
+def evaluate(match_filter: MatchFilter, groups: Mapping[str, Sequence[ScenePair]]) -> Figures:
     """Figures of every group of pairs with every kind of input."""
     return {
         group: {
-            kind: [evaluate_pair(network, pair, choose(pair)) for pair in tqdm(pairs, desc=f"{group}, {kind}")]
+            kind: [evaluate_pair(match_filter, pair, choose(pair)) for pair in tqdm(pairs, desc=f"{group}, {kind}")]
             for kind, choose in INPUT_KINDS.items()
         }
         for group, pairs in groups.items()
@@ -68,25 +70,29 @@ def summarize_all(figures: Figures) -> Summary:
 def write_markdown(summary: Summary, path: Path, command: str) -> None:
     """Both tables, and the command that made them."""
     names = [name for name in next(iter(next(iter(summary.values())).values())) if name != "thresholds"]
-    lines = [f"`{command}`", "", "| scenes | input | " + " | ".join(names) + " |", "|---|---|" + "---:|" * len(names)]
-    for group, kinds in summary.items():
-        for kind, values in kinds.items():
-            cells = [
-                f"{v:.0f}" if name in ("pairs", "matches") else f"{v:.1f}"
-                for name, v in values.items()
-                if name in names
-            ]
-            lines.append(f"| {group} | {kind} | " + " | ".join(cells) + " |")
-    lines += ["", "Precision / recall / F against the logit threshold:", ""]
+    figures = [
+        [group, kind, *(f"{values[name]:.{0 if name in ('pairs', 'matches') else 1}f}" for name in names)]
+        for group, kinds in summary.items()
+        for kind, values in kinds.items()
+    ]
     columns = [(group, kind) for group, kinds in summary.items() for kind in kinds]
-    lines += ["| logit > | " + " | ".join(", ".join(c) for c in columns) + " |", "|---:|" + "---:|" * len(columns)]
-    for row, threshold in enumerate(THRESHOLDS):
-        studies = [summary[group][kind]["thresholds"][row] for group, kind in columns]
-        lines.append(
-            f"| {threshold:+.1f} | "
-            + " | ".join(f"{s['precision']:.1f} / {s['recall']:.1f} / {s['F']:.1f}" for s in studies)
-            + " |"
-        )
+    studies = [
+        [f"{threshold:+.1f}"]
+        + [
+            "{precision:.1f} / {recall:.1f} / {F:.1f}".format(**summary[group][kind]["thresholds"][row])
+            for group, kind in columns
+        ]
+        for row, threshold in enumerate(THRESHOLDS)
+    ]
+    lines = [
+        f"`{command}`",
+        "",
+        render_table(["scenes", "input", *names], figures, align="llr"),
+        "",
+        "Precision / recall / F against the logit threshold:",
+        "",
+        render_table(["logit >", *(", ".join(column) for column in columns)], studies, align="r"),
+    ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -156,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except MgcaFilterError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    summary = summarize_all(evaluate(network, groups))
+    summary = summarize_all(evaluate(MatchFilter.over(NetworkBackend(network)), groups))
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "report.json").write_text(json.dumps({"command": command, **summary}, indent=1), encoding="utf-8")
     write_markdown(summary, options.out / "report.md", command)

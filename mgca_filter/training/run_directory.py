@@ -5,16 +5,18 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from ..evaluation.environment import library_versions, machine_description, source_commit
+from ..tables import render_table
 from .config import TrainingConfig
-from .curves import draw_curves
 
 LOG, VALIDATION, TABLE = "train.csv", "validation.csv", "validation.md"
+TRAINING_CURVES = ("loss", "classification", "geometric", "learning_rate")
 
 
 class RunDirectory:
@@ -46,9 +48,8 @@ class RunDirectory:
         """Add a row of validation figures, and draw table and curves anew."""
         self._append(VALIDATION, "validation", step, figures)
         rows = read_rows(self.folder / VALIDATION)
-        lines = [list(rows[0]), ["---:"] * len(rows[0])]
-        lines += [[row["step"], *(f"{float(v):.1f}" for k, v in row.items() if k != "step")] for row in rows]
-        table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+        cells = [[row["step"], *(f"{float(v):.1f}" for k, v in row.items() if k != "step")] for row in rows]
+        table = render_table(list(rows[0]), cells, align="r")
         (self.folder / TABLE).write_text(table + "\n", encoding="utf-8")
         draw_curves(self.folder / "curves.png", read_rows(self.folder / LOG), rows)
 
@@ -112,3 +113,32 @@ def _drop_rows_after(path: Path, step: int) -> None:
     whole = [row for row in rows if row.count(",") == header.count(",")]
     kept = [row for row in whole if int(row.split(",", 1)[0]) <= step]
     path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
+
+
+def draw_curves(path: Path, training: Sequence[dict[str, str]], validation: Sequence[dict[str, str]]) -> None:
+    """Write a PNG of the rows of ``train.csv`` and ``validation.csv``; nothing where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        return
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    axes = figure.subplots(2, 3).ravel()
+    for axis, name in zip(axes, TRAINING_CURVES):
+        rows = [row for row in training if row.get(name)]
+        axis.plot([int(row["step"]) for row in rows], [float(row[name]) for row in rows], linewidth=0.8)
+        axis.set_title(name.replace("_", " "))
+    names = [name for name in (validation[0] if validation else {}) if name != "step"]
+    poses = [name for name in names if "@" in name]
+    for axis, title, chosen in (
+        (axes[4], "matches, per cent", [name for name in names if name not in poses]),
+        (axes[5], "poses, per cent", poses),
+    ):
+        for name in chosen:
+            axis.plot([int(r["step"]) for r in validation], [float(r[name]) for r in validation], ".-", label=name)
+        axis.set_title(title)
+        if chosen:
+            axis.legend(fontsize="small")
+    for axis in axes:
+        axis.set_xlabel("step")
+        axis.grid(alpha=0.3)
+    figure.savefig(path, dpi=110)

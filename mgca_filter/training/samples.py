@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.epipolar import homogeneous, symmetric_epipolar_distance_squared
+from ..inputs.attributes import Column
 from .augmentation import (
     AugmentationConfig,
     draw_homographies,
@@ -16,8 +17,7 @@ from .augmentation import (
     transform_epipolar,
     transform_points,
 )
-from .labels import POSITIVE
-from .pairs import TrainingPair
+from .pairs import POSITIVE, TrainingPair
 from .sampling import Regime, SamplingConfig, draw_input
 from .sources import DataSource
 
@@ -82,7 +82,7 @@ def build_sample(draw: Draw, count: int, augmentation: AugmentationConfig) -> di
     correspondences, attributes, F = _augment(rng, draw, rows, augmentation)
     if draw.regime == "bare" and rng.random() < 0.5:  # no ratio, no best-of-list: a swap stays true
         correspondences, F = correspondences[:, [2, 3, 0, 1]], F.T
-        attributes[:, [2, 4]] *= -1.0
+        attributes[:, [Column.LOG2_SIZE, Column.SIN_TURN]] *= -1.0
     virtual, valid = virtual_correspondences(F)
     prior_rows = rng.integers(len(pair), size=PRIOR_MATCHES)
     return {

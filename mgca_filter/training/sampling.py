@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inputs.attributes import candidate_mask
+from ..inputs.attributes import Column, candidate_mask
 from .pairs import TrainingPair
 
 Regime = Literal["candidates", "filtered", "bare"]
@@ -16,6 +16,8 @@ REGIMES: tuple[Regime, ...] = ("candidates", "filtered", "bare")
 FILTERS = ("ratio", "mutual", "ratio and mutual", "best")
 FILTER_RATIO = (0.7, 0.9)
 MINIMUM_MATCHES = 32
+DISTANCE_COLUMNS = [Column.RATIO, Column.BEST, Column.RATIO_KNOWN, Column.BEST_KNOWN]
+SHAPE_COLUMNS = [Column.LOG2_SIZE, Column.COS_TURN, Column.SIN_TURN, Column.SHAPE_KNOWN]
 THINNED = 0.2  # share of the filtered lists of which a random part is left only
 
 
@@ -73,11 +75,11 @@ def filter_rows(pair: TrainingPair, attributes: NDArray[np.float32], kind: str, 
     """Rows that a user's own filter leaves; a filter that asks for what the source does not know leaves all."""
     keep = np.ones(len(attributes), dtype=bool)
     if kind.startswith("ratio"):
-        keep &= (attributes[:, 0] < max_ratio) | (attributes[:, 5] == 0)
+        keep &= (attributes[:, Column.RATIO] < max_ratio) | (attributes[:, Column.RATIO_KNOWN] == 0)
     if kind.endswith("mutual"):
         keep &= pair.mutual
     if kind == "best":
-        keep &= (attributes[:, 1] > 0) | (attributes[:, 6] == 0)
+        keep &= (attributes[:, Column.BEST] > 0) | (attributes[:, Column.BEST_KNOWN] == 0)
     return np.flatnonzero(keep)
 
 
@@ -96,10 +98,10 @@ def _forget(rng: np.random.Generator, attributes: NDArray[np.float32], regime: R
     """Attributes as a caller would have them who kept less than the matcher knew."""
     out = attributes.copy()
     if regime == "bare" or (regime == "filtered" and rng.random() < 0.5):
-        out[:, [0, 1, 5, 6]] = 0.0
+        out[:, DISTANCE_COLUMNS] = 0.0
         if regime == "bare" or rng.random() < 0.5:
-            out[:, [2, 3, 4, 7]] = 0.0
+            out[:, SHAPE_COLUMNS] = 0.0
             return out
     if rng.random() < 0.15:
-        out[:, [2, 3, 4, 7]] = 0.0
+        out[:, SHAPE_COLUMNS] = 0.0
     return out

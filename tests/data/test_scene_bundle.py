@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,18 @@ import pytest
 from conftest import Scene, make_scene
 from scene_bundles import bundle_fields, write_bundle
 
-from mgca_filter.data.scene_bundle import SceneBundle, load_scene_bundles
+from mgca_filter.data.scene_bundle import (
+    BundleImage,
+    BundlePair,
+    SceneBundle,
+    ScenePair,
+    load_scene_bundles,
+)
+from mgca_filter.data.scene_bundle import (
+    write_bundle as write,
+)
 from mgca_filter.errors import BundleError
+from mgca_filter.features import ImageFeatures, OneWayMatches
 from mgca_filter.geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
 
@@ -182,3 +193,56 @@ def test_folders_are_read_in_the_order_of_names(tmp_path: Path, scenes):
     for path in (tmp_path / "none", tmp_path / "none.npz"):
         with pytest.raises(BundleError, match="none"):
             load_scene_bundles(path)
+
+
+def content(pair: ScenePair, labels: np.ndarray | None = None) -> tuple[list[BundleImage], list[BundlePair]]:
+    """What a bundle of this pair alone is written from."""
+    known = pair.attributes
+    images = [
+        BundleImage(name, ImageFeatures(points, size, angle, None, K, image_size), R, t)
+        for name, points, size, angle, K, image_size, R, t in (
+            (pair.image1, pair.points1, known.size1, known.angle1, pair.K1, pair.image_size1, np.eye(3), np.zeros(3)),
+            (pair.image2, pair.points2, known.size2, known.angle2, pair.K2, pair.image_size2, pair.R, pair.t),
+        )
+    ]
+    rows = np.arange(len(pair.points1))
+    return images, [BundlePair(0, 1, OneWayMatches(rows, rows, known, pair.mutual), 9, labels)]
+
+
+@pytest.mark.parametrize("labelled", [False, True])
+def test_what_is_written_is_read(tmp_path, scenes, labelled):
+    changes = {
+        "keypoint_size": np.linspace(2, 40, 526).astype(np.float16),
+        "keypoint_angle": np.arange(526).astype(np.uint8),
+        "match_mutual": np.packbits(np.arange(263) % 3 == 0),
+        "match_best": np.packbits(np.arange(263) % 5 != 0),
+    }
+    pair = SceneBundle(write_bundle(tmp_path / "source.npz", scenes, **changes))[1]
+    labels = np.arange(63).astype(np.int8) % 3 - 1 if labelled else None
+    write(tmp_path / "source2.npz", *content(pair, labels))
+    again = SceneBundle(tmp_path / "source2.npz")[0]
+    for name in ("image1", "image2", "image_size1", "image_size2"):
+        assert getattr(again, name) == getattr(pair, name)
+    for name in ("points1", "points2", "K1", "K2", "R", "t", "mutual"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(pair, name))
+    for name, values in vars(pair.attributes).items():
+        np.testing.assert_array_equal(getattr(again.attributes, name), values)
+    np.testing.assert_array_equal(again.labels, labels)
+
+
+def test_what_cannot_be_written_leaves_no_file(tmp_path, scenes):
+    images, pairs = content(SceneBundle(write_bundle(tmp_path / "source.npz", scenes))[0])
+    unknown = replace(images[1], features=replace(images[1].features, K=None, angle=None))
+    matches = pairs[0].matches
+    alone = replace(matches, attributes=replace(matches.attributes, ratio=np.full(200, np.nan, np.float32)))
+    for given, message in (
+        ((images, []), "no pair to write"),
+        (([images[0], unknown], pairs), "001.jpg: not known: K, angle"),
+        ((images, [replace(pairs[0], matches=alone)]), "a match has no ratio"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            write(tmp_path / "hall.npz", *given)
+    assert not list(tmp_path.glob("hall*"))
+    equal = replace(matches, attributes=replace(matches.attributes, best=None))  # all distances are the same
+    write(tmp_path / "hall.npz", images, [replace(pairs[0], matches=equal)])
+    assert SceneBundle(tmp_path / "hall.npz")[0].attributes.best.all()

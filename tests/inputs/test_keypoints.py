@@ -1,4 +1,4 @@
-"""Keypoints in, from every type that OpenCV pipelines hold; detection in pixels of the original."""
+"""Keypoints in, from every type that OpenCV pipelines hold."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from mgca_filter.features import create_detector, detect_keypoints
 from mgca_filter.inputs.keypoints import read_keypoints
 
 
@@ -54,73 +53,3 @@ def test_integer_pixels_and_lists_of_pairs_are_accepted() -> None:
 def test_misuse_names_the_argument(value: object, error: type[Exception]) -> None:
     with pytest.raises(error, match="kp1"):
         read_keypoints(value, "kp1")
-
-
-@pytest.fixture(scope="module")
-def photograph() -> np.ndarray:
-    """Structured noise, 1800 x 1350."""
-    noise = np.random.default_rng(0).integers(0, 256, (90, 120)).astype(np.uint8)
-    return cv2.resize(noise, (1800, 1350), interpolation=cv2.INTER_CUBIC)
-
-
-@pytest.mark.parametrize("name", ["sift", "orb", "akaze"])
-def test_detectors_find_described_keypoints_inside_the_image(name: str, photograph: np.ndarray) -> None:
-    keypoints, descriptors = detect_keypoints(photograph, create_detector(name, 300))
-    points = read_keypoints(keypoints).points
-    assert len(keypoints) == len(descriptors) > 50
-    assert points.max(axis=0)[0] > 1500
-    assert (points >= 0).all()
-    assert (points < [1800, 1350]).all()
-
-
-def test_detection_in_a_shrunk_copy_returns_pixels_of_the_original(photograph: np.ndarray) -> None:
-    # A keypoint of the detector's image lies where its pixel's area lies in the original: corners stay corners.
-    small = cv2.resize(photograph, (1200, 900), interpolation=cv2.INTER_AREA)
-    detector = create_detector("sift", 200)
-    seen = read_keypoints(detector.detectAndCompute(small, None)[0])
-    returned = read_keypoints(detect_keypoints(photograph, detector)[0])
-    np.testing.assert_allclose(returned.points, (seen.points + 0.5) * 1.5 - 0.5, atol=1e-3)
-    np.testing.assert_allclose(returned.size, seen.size * 1.5, rtol=1e-5)
-
-
-def test_colour_and_grey_images_agree(photograph: np.ndarray) -> None:
-    detector = create_detector("sift", 100)
-    grey = detect_keypoints(photograph[:400, :400], detector)[1]
-    colour = detect_keypoints(cv2.cvtColor(photograph[:400, :400], cv2.COLOR_GRAY2BGR), detector)[1]
-    np.testing.assert_array_equal(grey, colour)
-
-
-def test_blank_image_has_no_keypoints() -> None:
-    keypoints, descriptors = detect_keypoints(np.zeros((50, 50), dtype=np.uint8), create_detector())
-    assert keypoints == []
-    assert len(descriptors) == 0
-
-
-@pytest.mark.parametrize(
-    ("image", "error"),
-    [(np.zeros((5, 5)), TypeError), ("file.png", TypeError), (None, TypeError)]
-    + [(np.zeros(shape, dtype=np.uint8), ValueError) for shape in [(5,), (0, 5), (5, 5, 2)]],
-)
-def test_what_is_no_image_is_named(image: object, error: type[Exception]) -> None:
-    with pytest.raises(error, match="image1"):
-        detect_keypoints(image, create_detector(), "image1")
-
-
-def test_unknown_detector_and_count_are_refused() -> None:
-    with pytest.raises(ValueError, match="detector"):
-        create_detector("surf")
-    with pytest.raises(ValueError, match="feature_count"):
-        create_detector("sift", 0)
-
-
-@pytest.mark.parametrize("name", ["sift", "orb", "akaze"])
-@pytest.mark.parametrize("shape", [(1, 1), (1, 500), (500, 2), (1, 3000), (6, 6), (7, 2500)])
-def test_images_of_a_few_pixels_are_data(name: str, shape: tuple[int, int]) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
-    keypoints, descriptors = detect_keypoints(noise, create_detector(name))
-    assert len(keypoints) == len(descriptors)
-
-
-def test_a_detector_that_does_not_describe_is_refused(photograph: np.ndarray) -> None:
-    with pytest.raises(TypeError, match="detector: expected one that describes, got FastFeatureDetector"):
-        detect_keypoints(photograph[:200, :200], cv2.FastFeatureDetector.create())

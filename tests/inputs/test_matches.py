@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgca_filter.features import match_descriptors
 from mgca_filter.inputs.attributes import best_of_list, distance_ratio
 from mgca_filter.inputs.matches import read_matches
 
@@ -112,19 +111,3 @@ def test_best_of_list_does_not_depend_on_the_order(rows: list[tuple[int, int]], 
     again = best_of_list(index[shuffled], distance[shuffled].astype(float))
     assert (best is None) == (again is None)
     np.testing.assert_array_equal(None if best is None else best[shuffled], again)
-
-
-def test_nearest_neighbours_by_both_norms() -> None:
-    descriptors = np.eye(4, dtype=np.float32)
-    rows = match_descriptors(descriptors, descriptors[::-1].copy())
-    assert [row[0].trainIdx for row in rows] == [3, 2, 1, 0]
-    assert all(len(row) == 2 for row in rows)
-    binary = np.array([[0], [255]], dtype=np.uint8)
-    assert [row[0].distance for row in match_descriptors(binary, binary[:1])] == [0.0, 8.0]
-
-
-def test_no_descriptors_no_matches_and_unequal_ones_are_refused() -> None:
-    floats = np.zeros((2, 4), dtype=np.float32)
-    assert match_descriptors(floats, np.zeros((0, 0), dtype=np.float32)) == ()
-    with pytest.raises(ValueError, match="descriptors2"):
-        match_descriptors(floats, np.zeros((2, 8), dtype=np.float32))

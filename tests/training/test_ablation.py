@@ -14,7 +14,7 @@ from tiny_config import CONFIG_TOML
 
 from mgca_filter.network import NetworkConfig
 from mgca_filter.training import ablation, run_directory
-from mgca_filter.training.ablation_rows import ROWS, Row, row_phases
+from mgca_filter.training.ablation import ROWS, Row, row_phases
 from mgca_filter.training.config import ScheduleConfig, SourceConfig, TrainingConfig, load_config
 
 BASE = TrainingConfig(name="x", schedule=ScheduleConfig(steps=7000, warmup_steps=200))

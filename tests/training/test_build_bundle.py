@@ -12,7 +12,7 @@ from photographs import write_photographs
 from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.training.build_bundle import choose_pairs, main
-from mgca_filter.training.sources.bundles import BundleSource, check_pairs
+from mgca_filter.training.sources import BundleSource
 from mgca_filter.training.worlds.photographs import PhotoFolder
 from mgca_filter.training.worlds.views import View, draw_views
 
@@ -53,7 +53,7 @@ def test_a_bundle_has_the_geometry_of_the_images(views, tmp_path, radial):
     folder = write_reconstruction(tmp_path / "scene", views[:2], radial)
     assert main([str(folder), str(folder / "images"), str(tmp_path / "hall.npz")]) == 0
     bundle = SceneBundle(tmp_path / "hall.npz")
-    check_pairs(bundle)
+    bundle.check_training_pairs()
     pair = bundle[0]
     forward = pair.image1 == "1.png"
     one, two = views[:2] if forward else views[1::-1]

@@ -106,6 +106,16 @@ def test_every_table_is_read(tmp_path):
         ('name = "x"\n[schedule]\nsteps = 1.5', "schedule.steps"),
         ('name = "x"\n[schedule]\nprecision = "fp16"', "schedule.precision"),
         ("name = ", "[Ii]nvalid"),
+        # What is asked for is named as well, in the file's own words.
+        ('name = "x"\nseed = 1.0', "seed: expected int, got 1.0$"),
+        ('name = "x"\n[sampling]\nbatch_size = true', "sampling.batch_size: expected int, got True$"),
+        ('name = "x"\n[augmentation]\nturn = true', "augmentation.turn: expected float, got True$"),
+        ('name = "x"\n[sampling]\nmatches = [1, true]', "sampling.matches.*: expected int, got True$"),
+        ('name = "x"\n[sampling]\nmatches = 3', r"sampling.matches: expected a list of int, got 3$"),
+        ('name = "x"\nscenes = "hall"', r"scenes: expected a list of str, got 'hall'$"),
+        ('name = "x"\n[schedule]\nkind = "line"', "schedule.kind: expected one of cosine, steps, got 'line'$"),
+        ('name = "x"\n[sampling]\nb = 1\na = 2', "sampling.a: unknown key$"),
+        ('name = "x"\nsources = ["a"]', r"sources\[0\]: expected a table, got 'a'$"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, text, key):

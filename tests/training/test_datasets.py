@@ -18,21 +18,21 @@ from mgca_filter.errors import BundleError
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.training.augmentation import AugmentationConfig
 from mgca_filter.training.datasets import TrainingDataset
-from mgca_filter.training.labels import POSITIVE, clean_labels
-from mgca_filter.training.pairs import TrainingPair
+from mgca_filter.training.pairs import POSITIVE, TrainingPair, clean_labels
 from mgca_filter.training.samples import (
     PRIOR_MATCHES,
     DegenerateDataError,
+    Draw,
     build_sample,
+    draw_sample,
     has_variety,
     virtual_correspondences,
 )
-from mgca_filter.training.sampling import SamplingConfig
-from mgca_filter.training.sources.bundles import BundleSource, is_held_out
+from mgca_filter.training.sampling import DISTANCE_COLUMNS, SHAPE_COLUMNS, SamplingConfig
+from mgca_filter.training.sources import BundleSource, is_held_out
 
 SAMPLING = SamplingConfig(batch_size=4, matches=(40, 64), matches_weights=(0.5, 0.5), holdout_every=3, pool_batches=2)
 UNCHANGED = AugmentationConfig(tilt_deg=0.0, roll_deg=0.0, turn=0.0, mirror=0.0, focal_error=0.0)
-GEOMETRY, RATIO_AND_BEST = [2, 3, 4, 7], [0, 1, 5, 6]
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,11 @@ def build(bundles: list[SceneBundle], seed: int = 0, **changes: object) -> Train
     sampling = dataclasses.replace(SAMPLING, **changes)
     source = BundleSource(bundles, sampling.scene_exponent, sampling.holdout_every)
     return TrainingDataset(source, sampling, AugmentationConfig(), seed, 12)
+
+
+def drawn_from(dataset: TrainingDataset, *seed: int) -> Draw:
+    """One sample as the dataset draws it."""
+    return draw_sample(dataset.source, dataset.sampling, seed)
 
 
 def place(pair: TrainingPair) -> tuple[int, int]:
@@ -169,7 +174,7 @@ def test_held_out_pairs_are_never_drawn(bundles):
     assert [index for index in range(9) if is_held_out(index, 3)] == [1, 4, 7]
     assert not any(is_held_out(index, 0) for index in range(100))
     dataset = build(bundles)
-    drawn = {place(dataset.draw((0, i)).pair) for i in range(300)}
+    drawn = {place(drawn_from(dataset, 0, i).pair) for i in range(300)}
     assert drawn == {(0, index) for index in (0, 2, 3, 5, 6)} | {(1, 0)}
 
 
@@ -177,7 +182,7 @@ def test_held_out_pairs_are_never_drawn(bundles):
 def test_scenes_are_drawn_by_their_exponent(bundles, exponent, share):
     dataset = build(bundles, scene_exponent=exponent, holdout_every=0)
     np.testing.assert_allclose(dataset.source.scene_probability, [share, 1 - share])
-    drawn = [place(dataset.draw((1, i)).pair)[0] for i in range(200)]
+    drawn = [place(drawn_from(dataset, 1, i).pair)[0] for i in range(200)]
     assert abs(np.mean(drawn) - (1 - share)) < 0.12
 
 
@@ -187,7 +192,7 @@ def only(regime: str) -> dict[str, float]:
 
 def draws(bundles: list[SceneBundle], regime: str, number: int = 60) -> list:
     dataset = build(bundles, **only(regime))
-    found = [dataset.draw((2, i)) for i in range(number)]
+    found = [drawn_from(dataset, 2, i) for i in range(number)]
     assert {draw.regime for draw in found} == {regime}
     return found
 
@@ -200,8 +205,8 @@ def test_candidates_are_best_of_the_list_and_below_the_ratio(bundles):
         assert (kept[:, 1] == 1).all()
         encoded = scene_pair(bundles, draw.pair).attributes.encode(len(draw.attributes))
         assert len(draw.rows) == np.count_nonzero((encoded[:, 0] < 0.95) & (encoded[:, 1] == 1))
-        np.testing.assert_array_equal(draw.attributes[:, RATIO_AND_BEST], encoded[:, RATIO_AND_BEST])
-        forgotten += int((draw.attributes[:, GEOMETRY] == 0).all())
+        np.testing.assert_array_equal(draw.attributes[:, DISTANCE_COLUMNS], encoded[:, DISTANCE_COLUMNS])
+        forgotten += int((draw.attributes[:, SHAPE_COLUMNS] == 0).all())
     assert 0 < forgotten < 25  # sizes and angles are unknown now and then
 
 
@@ -232,7 +237,7 @@ def test_filtered_lists_passed_a_ratio_test_or_a_cross_check(bundles):
 def test_samples_are_their_pairs_where_nothing_is_changed(bundles):
     dataset = build(bundles, **only("candidates"))
     for i in range(5):
-        draw = dataset.draw((3, i))
+        draw = drawn_from(dataset, 3, i)
         sample = build_sample(draw, 40, UNCHANGED)
         pair = scene_pair(bundles, draw.pair)
         everything = pair.correspondences.astype(np.float32)
@@ -249,7 +254,7 @@ def test_right_matches_and_virtual_points_share_one_geometry(bundles, regime):
     dataset = build(bundles, **only(regime))
     checked = 0
     for i in range(12):
-        sample = build_sample(dataset.draw((4, i)), 60, AugmentationConfig())
+        sample = build_sample(drawn_from(dataset, 4, i), 60, AugmentationConfig())
         assert sample["virtual_valid"] == 1
         # The geometry is that of the virtual points: solve it from them, without the dataset's help.
         x1, x2 = (np.hstack([p, np.ones((400, 1))]) for p in np.hsplit(sample["virtual"].astype(float), 2))
@@ -277,7 +282,7 @@ def test_virtual_points_lie_on_the_geometry(bundles):
 
 def test_pairs_with_few_right_matches_have_no_virtual_points(bundles):
     dataset = build(bundles)
-    draw = dataset.draw((5, 0))
+    draw = drawn_from(dataset, 5, 0)
     wrong = np.flatnonzero(clean_labels(scene_pair(bundles, draw.pair)) != POSITIVE)
     assert build_sample(dataclasses.replace(draw, rows=wrong), 30, UNCHANGED)["virtual_valid"] == 0
 

@@ -11,11 +11,12 @@ from conftest import make_scene
 from networks import tiny_network
 from scene_bundles import bundle_fields, write_bundle
 
+from mgca_filter import MatchFilter
 from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
+from mgca_filter.inference.network_backend import NetworkBackend
 from mgca_filter.network import save_network
-from mgca_filter.training.input_kinds import INPUT_KINDS
 from mgca_filter.training.report import THRESHOLDS, main, threshold_study
-from mgca_filter.training.validation import PairFigures, evaluate_pair, held_out_pairs, summarize
+from mgca_filter.training.validation import INPUT_KINDS, PairFigures, evaluate_pair, held_out_pairs, summarize
 
 
 @pytest.fixture(scope="module")
@@ -51,12 +52,13 @@ def test_kinds_of_input_are_what_callers_have(pair):
 
 
 def test_every_match_of_the_input_has_a_logit(pair):
+    match_filter = MatchFilter.over(NetworkBackend(tiny_network()))
     for choose in INPUT_KINDS.values():
-        figures = evaluate_pair(tiny_network(), pair, choose(pair))
+        figures = evaluate_pair(match_filter, pair, choose(pair))
         assert figures.logits.shape == figures.truth.shape == (len(choose(pair)[0]),)
         assert np.isfinite(figures.logits).all()
-    nothing = evaluate_pair(tiny_network(), pair, (np.zeros(0, dtype=np.intp), pair.attributes.take(np.zeros(0, int))))
-    assert nothing.fit_deg == nothing.own_deg == 180.0
+    nothing = evaluate_pair(match_filter, pair, (np.zeros(0, dtype=np.intp), pair.attributes.take(np.zeros(0, int))))
+    assert nothing.fit_deg == nothing.essential_deg == 180.0
 
 
 def test_thresholds_trade_precision_for_recall():

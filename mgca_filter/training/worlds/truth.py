@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry.epipolar import symmetric_epipolar_distance_squared
-from ..labels import IGNORED, NEGATIVE, NEGATIVE_DISTANCE, POSITIVE, POSITIVE_DISTANCE
+from ..pairs import IGNORED, NEGATIVE, NEGATIVE_DISTANCE, POSITIVE, POSITIVE_DISTANCE
 from .cameras import Camera
 from .visibility import NOTHING, VisibilityMap
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ...data.bundle_writer import BundleImage, BundlePair
+from ...data.scene_bundle import BundleImage, BundlePair
+from ...features import OneWayMatches, match_features
 from ...geometry.cameras import normalize_points
 from ...geometry.epipolar import essential_from_pose
-from ..labels import POSITIVE
-from ..sift import OneWayMatches, match_one_way
+from ..pairs import POSITIVE
 from .truth import match_labels, transfer_error, visible_share
 from .views import View
 
@@ -41,9 +41,8 @@ class ViewPair:
 
 def match_views(view1: View, view2: View) -> ViewPair:
     """Match two views of one world and label the matches by depth."""
-    matches = match_one_way(view1.features, view2.features)
-    points1, points2 = view1.features.points, view2.features.points[matches.index2]
-    points1 = points1[: len(points2)]
+    matches = match_features(view1.features, view2.features)
+    points1, points2 = view1.features.points[matches.index1], view2.features.points[matches.index2]
     camera1, camera2 = view1.camera, view2.camera
     R = camera2.R @ camera1.R.T
     t = camera2.t - R @ camera1.t
@@ -55,8 +54,7 @@ def match_views(view1: View, view2: View) -> ViewPair:
 
 def bundle_image(view: View, name: str) -> BundleImage:
     """A view as a scene bundle keeps it."""
-    camera, features = view.camera, view.features
-    return BundleImage(name, camera.size, camera.K, camera.R, camera.t, features.points, features.size, features.angle)
+    return BundleImage(name, view.features, view.camera.R, view.camera.t)
 
 
 def bundle_pairs(rng: np.random.Generator, views: Sequence[View]) -> list[BundlePair]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sift import SiftFeatures, detect_sift
+from ...features import ImageFeatures, create_detector, describe
 from .cameras import Camera, draw_camera
 from .imaging import add_passers_by, draw_light, photograph
 from .photographs import PhotoFolder
@@ -24,11 +24,11 @@ NEAREST_ALLOWED = 0.08  # of the world's distance: nothing may stand right befor
 
 @dataclass(frozen=True)
 class View:
-    """One rendered photograph: uint8 (H, W), its camera, its keypoints and what each pixel shows."""
+    """One rendered photograph: uint8 (H, W), its camera, its keypoints (SIFT) and what each pixel shows."""
 
     image: NDArray[np.uint8]
     camera: Camera
-    features: SiftFeatures
+    features: ImageFeatures
     visible: VisibilityMap
 
 
@@ -78,4 +78,4 @@ def _take(rng: np.random.Generator, world: World, camera: Camera, photos: PhotoF
     image = paint(world, camera, visible, photos, focal_px, draw_light(rng, len(world.faces)))
     add_passers_by(rng, image, visible, photos)
     image = photograph(rng, image)
-    return View(image, camera, detect_sift(image), visible)
+    return View(image, camera, replace(describe(image, create_detector()), K=camera.K), visible)

@@ -11,7 +11,7 @@ from conftest import SIZE, K, make_scene
 from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.geometry.epipolar import symmetric_epipolar_distance_squared
 from mgca_filter.inputs.attributes import MatchAttributes
-from mgca_filter.training.labels import IGNORED, NEGATIVE, POSITIVE, clean_labels
+from mgca_filter.training.pairs import IGNORED, NEGATIVE, POSITIVE, clean_labels
 
 R, T = np.eye(3), np.array([1.0, 0.0, 0.0])  # epipolar lines are rows, disparity is 1 / depth
 
