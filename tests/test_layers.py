@@ -27,7 +27,7 @@ FLOORS = (
     ("fit",),
     ("features",),
     ("inputs",),
-    ("network", "drawing", "images", "image_header"),
+    ("network", "drawing", "images"),
     ("geometry",),
     ("result", "types", "atomic_file"),
     ("errors",),

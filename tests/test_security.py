@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from conftest import METADATA, build_model
+from mgca_filter.image_header import MAX_PIXELS, promised_size
 
 import mgca_filter
 from mgca_filter import ModelError, cli, model_path
 from mgca_filter.evaluation.hostile_files import png_that_promises
-from mgca_filter.image_header import MAX_PIXELS, promised_size
 from mgca_filter.inference import metadata as backend_metadata
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.checksums import SUMS_NAME, check_checksum, read_checksums, record_checksums

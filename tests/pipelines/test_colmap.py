@@ -15,7 +15,7 @@ from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
 pycolmap = pytest.importorskip("pycolmap")
 from mgca_filter.pipelines import colmap  # noqa: E402
-from mgca_filter.pipelines.colmap_compare import compare  # noqa: E402
+from mgca_filter.pipelines.mapper_comparison import compare  # noqa: E402
 from mgca_filter.pipelines.worker import PairRow  # noqa: E402
 
 CONFIGURATION = pycolmap.TwoViewGeometryConfiguration

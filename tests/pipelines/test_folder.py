@@ -18,8 +18,7 @@ from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.geometry.epipolar import pose_error_deg
-from mgca_filter.pipelines.folder import FolderJob
-from mgca_filter.pipelines.folder_pairs import exhaustive_pairs, sequential_pairs
+from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
 
@@ -189,10 +188,10 @@ def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
     from mgca_filter.pipelines.journal import Journal
 
     (tmp_path / "out.jsonl.work").mkdir()
-    journal = Journal(tmp_path / "out.jsonl.work" / "journal.db")
+    journal = Journal(tmp_path / "out.jsonl.work" / "journal.log")
     journal.begin({"threshold": 2.0})
     assert run(image_folder, tmp_path / "out.jsonl") == 2
-    assert_one_line(capsys.readouterr(), "journal.db", "locked by another process")
+    assert_one_line(capsys.readouterr(), "journal.log", "locked by another process")
     journal.close()
     assert run(image_folder, tmp_path / "out.jsonl") == 2
     assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 2.0 instead of 1.0")
