@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import sys
 import time
@@ -10,7 +11,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import chain, islice
 from pathlib import Path
 from types import TracebackType
@@ -82,9 +83,8 @@ class Workers:
         self._options, self._count, self._ray = json.dumps(filter_options), count, None
         if engine == "ray":
             self._ray = _start_ray(count, address)
-        retries = {"num_cpus": 1, "max_restarts": RAY_RETRIES, "max_task_retries": RAY_RETRIES}
-        backend = {"backend": "ray", "ray_remote_args": retries} if self._ray else {"backend": "loky"}
-        with joblib.parallel_config(inner_max_num_threads=None if self._ray else 1, **backend):
+        backend = {"backend": "ray"} if self._ray else {"backend": "loky", "inner_max_num_threads": 1}
+        with joblib.parallel_config(**backend):
             # Arrays travel with their task: no files in shared memory that a killed run leaves behind.
             self._parallel = joblib.Parallel(
                 count,
@@ -155,18 +155,30 @@ class Workers:
 
 
 def _start_ray(count: int, address: str | None) -> Any:
-    """The module of a Ray that runs, registered with joblib."""
-    import logging
-
+    """The module of a Ray that runs, as joblib's backend "ray"."""
+    import joblib
     import ray
-    from ray.util.joblib import register_ray
+    from ray.util.joblib.ray_backend import RayBackend
+
+    class StreamingRayBackend(RayBackend):
+        """Ray's backend, freed of what it inherits from joblib's for multiprocessing: that it does not stream, and
+        that it stops its actors one by one where Ray itself ends with the run."""
+
+        supports_return_generator = True
+
+        def terminate(self) -> None:
+            pass
+
+        def abort_everything(self, ensure_ready: bool = True) -> None:
+            pass
 
     local: dict[str, Any] = {"num_cpus": count, "include_dashboard": False} if address is None else {}
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **local)
     except (ConnectionError, RuntimeError, ValueError) as error:
         raise PipelineError(f"Ray at {address or 'this machine'}: {' '.join(str(error).split())}") from error
-    register_ray()
+    actor = {"num_cpus": 1, "max_restarts": RAY_RETRIES, "max_task_retries": RAY_RETRIES}
+    joblib.register_parallel_backend("ray", partial(StreamingRayBackend, ray_remote_args=actor))
     return ray
 
 
