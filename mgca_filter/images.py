@@ -41,7 +41,7 @@ def decode_image(data: bytes, flags: int = cv2.IMREAD_COLOR) -> NDArray[np.uint8
 
 
 def _eight_bits(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    counts = sum(cv2.calcHist([image], [channel], None, [65536], [0, 65536])[:, 0] for channel in range(3))
+    counts = sum(cv2.calcHist([image], [channel], None, [65536], [0, 65536]).ravel() for channel in range(3))
     low, high = np.searchsorted(np.cumsum(counts, dtype=np.float64), np.multiply(_STRETCHED_SHARE, image.size))
     if high - low >= 2**15:
         return (image >> 8).astype(np.uint8)

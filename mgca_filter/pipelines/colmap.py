@@ -156,8 +156,13 @@ def open_database(path: Path, name: Path | None = None) -> Any:
     missing = {"cameras", "images", "keypoints", "descriptors", "matches"} - tables
     if missing:
         raise PipelineError(f"{name or path}: not a COLMAP database, tables missing: {', '.join(sorted(missing))}")
-    with _damage(name or path):
-        return pycolmap.Database.open(path)
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # its warning of what it raises all the same
+    try:
+        with _damage(name or path):
+            return pycolmap.Database.open(path)
+    finally:
+        pycolmap.logging.minloglevel = level
 
 
 def content_digest(path: Path) -> str:

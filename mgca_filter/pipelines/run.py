@@ -160,7 +160,7 @@ def _start_ray(count: int, address: str | None) -> Any:
     import ray
     from ray.util.joblib.ray_backend import RayBackend
 
-    class StreamingRayBackend(RayBackend):
+    class StreamingRayBackend(RayBackend):  # type: ignore[misc,unused-ignore]
         """Ray's backend, freed of what it inherits from joblib's for multiprocessing: that it does not stream, and
         that it stops its actors one by one where Ray itself ends with the run."""
 

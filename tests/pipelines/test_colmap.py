@@ -8,7 +8,7 @@ from contextlib import closing
 import multi_view
 import numpy as np
 import pytest
-from pipeline_command import assert_one_line
+from pipeline_command import assert_one_line, start_command
 
 from mgca_filter import cli
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
@@ -195,6 +195,77 @@ def test_database_locked_by_another_process(database, tmp_path, capsys):
     assert read_geometries(database) == {}
     assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0  # from the journal of the first try
     assert len(read_geometries(database)) == 6
+
+
+def change(database, *statements: str) -> None:
+    with closing(sqlite3.connect(database)) as plain:
+        for statement in statements:
+            plain.execute(statement)
+        plain.commit()
+
+
+UNUSABLE = {
+    "no camera": (["INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras",
+                   "UPDATE images SET camera_id = 2 WHERE image_id = 2", "PRAGMA foreign_keys = OFF",
+                   "DELETE FROM cameras WHERE camera_id = 2"], ["view01.png: its camera 2 is not in the database"]),
+    "focal length 0": (["INSERT INTO cameras SELECT 2, model, width, height, zeroblob(32), 1 FROM cameras",
+                        "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: its camera 2", "0, 0"]),
+    "short parameters": (["INSERT INTO cameras SELECT 2, model, width, height, zeroblob(16), 1 FROM cameras",
+                          "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: "]),
+    "unknown model": (["INSERT INTO cameras SELECT 2, 99, width, height, params, 1 FROM cameras",
+                       "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: "]),
+    "short keypoints": (["UPDATE keypoints SET data = zeroblob(10) WHERE image_id = 2"], ["view01.png: "]),
+    "short descriptors": (["UPDATE descriptors SET data = zeroblob(10) WHERE image_id = 2"], ["view01.png: "]),
+    "short matches": (["UPDATE matches SET data = zeroblob(3)"], [" with "]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", UNUSABLE)
+def test_a_damaged_row_costs_its_own_pairs_only(database, tmp_path, capsys, defect):
+    statements, words = UNUSABLE[defect]
+    change(database, *statements)
+    status = cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"])
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert captured.out == ""
+    assert all(word in lines[0] for word in words), lines
+    assert "Traceback" not in captured.err
+    healthy = 0 if defect == "short matches" else 3
+    assert status == (0 if healthy else 1)
+    assert lines[-1] == f"mgca-match: {6 - healthy} pairs failed"
+    assert len(read_geometries(tmp_path / "out.db")) == healthy
+
+
+def test_a_name_that_is_not_utf8_is_a_name(database, tmp_path):
+    change(database, "UPDATE images SET name = CAST(x'66DF2E706E67' AS TEXT) WHERE image_id = 2")
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    assert len(read_geometries(tmp_path / "out.db")) == 6
+
+
+@pytest.mark.parametrize(
+    ("statement", "words"),
+    [
+        ("DROP TABLE descriptors", ["raw.db", "not a COLMAP database", "descriptors"]),
+        ("ALTER TABLE cameras RENAME COLUMN params TO p", ["raw.db"]),
+        ("ALTER TABLE images RENAME COLUMN camera_id TO camera", ["raw.db"]),
+        ("ALTER TABLE matches DROP COLUMN rows", ["raw.db"]),
+        ("DROP TABLE two_view_geometries", []),
+    ],
+)
+def test_a_database_of_another_make_is_one_line(database, tmp_path, statement, words):
+    """In a process of its own: COLMAP's library must not take it down either."""
+    change(database, "PRAGMA foreign_keys = OFF", "DROP INDEX IF EXISTS index_name", statement)
+    process = start_command("colmap", database, "-o", tmp_path / "out.db", "-q")
+    out, err = process.communicate(timeout=120)
+    assert (process.returncode, err.count("\n")) == ((2, 1) if words else (0, 0)), err
+    for word in words:
+        assert word in err
+
+
+def test_a_truncated_database_is_one_line(database, tmp_path, capsys):
+    database.write_bytes(database.read_bytes()[:-20_000])
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 2
+    assert_one_line(capsys.readouterr(), "raw.db")
 
 
 def test_misuse_is_one_line(database, tmp_path, capsys):
