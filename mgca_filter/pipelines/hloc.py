@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from .journal import Journal, PipelineError, file_stamp, output_file
 from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import FAILED, ImageFeatures, PairRow
+from .worker import FAILED, ImageFeatures, PairRow, Unusable
 
 _SIFT_LENGTH = 128
 
@@ -113,9 +113,14 @@ class HlocSource:
         """Names of the images in the order of the pair's group."""
         return sorted(self.groups)
 
-    def image(self, name: str) -> ImageFeatures:
+    def image(self, name: str) -> ImageFeatures | Unusable:
         """Features of an image; descriptors where they are SIFT's, which come with scale and orientation."""
-        group = self._features[name]
+        try:
+            return self._image(self._features[name])
+        except (OSError, ValueError, TypeError) as error:
+            return Unusable(f"{self._features.filename}: {name} cannot be read ({' '.join(str(error).split())})")
+
+    def _image(self, group: Any) -> ImageFeatures:
         points = group["keypoints"][()].astype(np.float64)
         scale, angle = (group[key][()] if key in group else None for key in ("scales", "oris"))
         descriptors = None
@@ -127,9 +132,13 @@ class HlocSource:
         image_size = tuple(int(side) for side in group["image_size"][()]) if "image_size" in group else None
         return ImageFeatures(points, size, angle, descriptors, None, image_size)  # type: ignore[arg-type]
 
-    def matches(self, name1: str, name2: str) -> NDArray[Any]:
+    def matches(self, name1: str, name2: str) -> NDArray[Any] | Unusable:
         """Matches (M, 2) of a pair."""
-        partner = self._matches[self.groups[name1, name2]]["matches0"][()]
+        group = self.groups[name1, name2]
+        try:
+            partner = self._matches[group]["matches0"][()]
+        except OSError as error:
+            return Unusable(f"{self._matches.filename}: {group} cannot be read ({' '.join(str(error).split())})")
         rows = np.flatnonzero(partner > -1)
         return np.stack([rows, partner[rows].astype(np.intp)], axis=1)
 
