@@ -175,7 +175,7 @@ def _start_ray(count: int, address: str | None) -> Any:
     local: dict[str, Any] = {"num_cpus": count, "include_dashboard": False} if address is None else {}
     try:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR, **local)
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except Exception as error:  # Ray raises this one itself where its processes do not start
         raise PipelineError(f"Ray at {address or 'this machine'}: {' '.join(str(error).split())}") from error
     actor = {"num_cpus": 1, "max_restarts": RAY_RETRIES, "max_task_retries": RAY_RETRIES}
     joblib.register_parallel_backend("ray", partial(StreamingRayBackend, ray_remote_args=actor))

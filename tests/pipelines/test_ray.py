@@ -22,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
 def paths(monkeypatch):
     """Ray's workers import the package from here, whether it is installed or not."""
     root = os.path.dirname(os.path.dirname(os.path.dirname(__file__)))
-    monkeypatch.setenv("PYTHONPATH", root)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 starves on a busy machine
 
@@ -58,10 +58,14 @@ def actors(workers: Workers) -> list:
 
 
 def test_workers_that_stay_dead_are_a_pipeline_error(paths):
-    with pytest.raises(PipelineError, match="a Ray worker died more than 3 times"), Workers({}, 2, "ray") as workers:
-        for _ in workers.map("extract", ((f"{k}.png", b"", "sift", 10) for k in range(100))):
-            for actor in actors(workers):
-                ray.kill(actor, no_restart=True)
+    def kill_again_and_again() -> None:
+        with Workers({}, 2, "ray") as workers:
+            for _ in workers.map("extract", ((f"{k}.png", b"", "sift", 10) for k in range(100))):
+                for actor in actors(workers):
+                    ray.kill(actor, no_restart=True)
+
+    with pytest.raises(PipelineError, match="a Ray worker died more than 3 times"):
+        kill_again_and_again()
     assert not ray.is_initialized()
 
 
