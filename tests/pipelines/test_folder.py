@@ -43,7 +43,7 @@ def expected(tmp_path_factory, views):
 
 
 def test_rows_equal_match_images(image_folder, views, expected):
-    """The pipeline is the public door, pair by pair."""
+    """The pipeline is ``match_images``, pair by pair."""
     rows = [json.loads(line) for line in expected.splitlines()]
     assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
     for row in rows:
@@ -257,7 +257,7 @@ def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path,
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
 
     cache = ["--cache", tmp_path / "cache"]
-    assert run(image_folder, tmp_path / "first.jsonl", *cache) == 0
+    assert run(image_folder, tmp_path / "first.jsonl", *cache, "--pairs", "sequential", "--overlap", 1) == 0
     process = start_command("folder", image_folder, "-o", output, *OPTIONS, *cache, preexec_fn=little_disk)
     out, err = process.communicate()
     assert process.returncode == 2

@@ -78,8 +78,8 @@ def walk(file):
 
 
 def test_the_filter_sees_the_files_as_they_are(tmp_path, views, raw_matches):
-    """Bare points and the image's size: the same rows as the public door."""
-    features, matches = write_files(tmp_path, views, raw_matches, sift=False)
+    """Points and the image's size: the same rows as ``MatchFilter``."""
+    features, matches = write_files(tmp_path, views, {(0, 1): raw_matches[0, 1]}, sift=False)
     assert run(features, matches, tmp_path / "filtered.h5", "-q", "--threshold", "2") == 0
     size = views[0].image.shape[1::-1]
     with h5py.File(tmp_path / "filtered.h5") as file:
@@ -91,7 +91,7 @@ def test_the_filter_sees_the_files_as_they_are(tmp_path, views, raw_matches):
 
 
 def test_descriptors_are_used_unless_forbidden(tmp_path, views, raw_matches):
-    features, matches = write_files(tmp_path, views, raw_matches)
+    features, matches = write_files(tmp_path, views, {(0, 1): raw_matches[0, 1]})
     assert run(features, matches, tmp_path / "with.h5", "-q") == 0
     assert run(features, matches, tmp_path / "without.h5", "-q", "--no-descriptors") == 0
     first, second = contents(tmp_path / "with.h5"), contents(tmp_path / "without.h5")
