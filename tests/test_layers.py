@@ -28,7 +28,7 @@ FLOORS = (
     ("features",),
     ("inputs",),
     ("result",),
-    ("network", "drawing", "images", "image_header", "tables"),
+    ("network", "drawing", "images", "tables"),
     ("geometry",),
     ("types", "atomic_file"),
     ("errors",),

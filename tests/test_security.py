@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import ast
+import os
+import subprocess
+import sys
 from pathlib import Path
 
-import cv2
-import numpy as np
 import pytest
 from conftest import METADATA, build_model
+from image_files import promising
 
 import mgca_filter
-from benchmarks.bad_input.files import png_that_promises
-from mgca_filter import ModelError, cli, model_path
-from mgca_filter.image_header import MAX_PIXELS, promised_size
+from mgca_filter import ModelError, model_path
 from mgca_filter.inference import metadata as backend_metadata
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.checksums import SUMS_NAME, check_checksum, read_checksums, record_checksums
@@ -88,26 +88,50 @@ def test_the_contract_is_checked_before_a_runtime_sees_the_file(
         open_backend(path)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_size_is_read_from_the_header(suffix: str) -> None:
-    image = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
-    data = cv2.imencode(suffix, image)[1].tobytes()
-    assert promised_size(data) == (53, 37)
-    for count in range(0, 30):
-        assert promised_size(data[:count]) in (None, (53, 37))
-    assert promised_size(b"GIF89a") is None
+def run_measured(path: Path, limit_s: float) -> tuple[int, str, int]:
+    """``mgca-match`` on an image file and itself: exit status, stderr, and the most memory it held, in megabytes."""
+    program = (
+        "import resource, sys; from mgca_filter import cli; status = cli.main([sys.argv[1], sys.argv[1]]);"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024); sys.exit(status)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(PACKAGE.parent)}
+    command = [sys.executable, "-c", program, str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=limit_s)
+    return done.returncode, done.stderr, int(done.stdout.split()[-1])
 
 
-def test_an_image_that_promises_too_much_is_not_decoded(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cv2, "imdecode", lambda *arguments: pytest.fail("decoded"))
-    path = tmp_path / "bomb.png"
-    path.write_bytes(png_that_promises(20_000, 20_000))
-    assert MAX_PIXELS < 20_000**2
-    assert cli.main([str(path), str(path)]) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert "bomb.png" in error
-    assert "20000 x 20000" in error
-    assert PairWorker({}).extract("bomb.png", path.read_bytes(), "sift", 10) == ("bomb.png", None)
+# 2^30 pixels are OpenCV's own limit; no side of a WebP is longer than 16383.
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".ppm"])
+def test_an_image_that_promises_too_much_is_not_decoded(tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"bomb{suffix}"
+    path.write_bytes(promising(suffix, 60_000, 60_000))
+    status, error, megabytes = run_measured(path, limit_s=60.0)
+    assert status == 2
+    assert error.count("\n") == 1, error
+    assert path.name in error
+    assert megabytes < 500
+    assert PairWorker({}).extract(path.name, path.read_bytes(), "sift", 10) == (path.name, None)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".bmp", ".tiff", ".ppm"])
+def test_a_file_without_the_pixels_it_promises_takes_no_memory(tmp_path: Path, suffix: str) -> None:
+    """Within OpenCV's limit, and 2.7 GB in colour, were the pixels there."""
+    path = tmp_path / f"short{suffix}"
+    path.write_bytes(promising(suffix, 30_000, 30_000))
+    status, error, megabytes = run_measured(path, limit_s=60.0)
+    assert status == 2
+    assert "short" in error.splitlines()[-1]
+    assert "Traceback" not in error
+    assert megabytes < 500
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("suffix", "size"), [(".webp", 16_383), (".jpg", 16_000)])
+def test_the_largest_images_that_a_small_file_can_hold_are_only_large(tmp_path: Path, suffix: str, size: int) -> None:
+    """A few bytes of WebP are a whole image of one colour, and JPEG fills up what is missing: no crash, no geometry."""
+    path = tmp_path / f"flat{suffix}"
+    path.write_bytes(promising(suffix, size, size))
+    status, error, megabytes = run_measured(path, limit_s=250.0)
+    assert status == 1
+    assert "Traceback" not in error
+    assert megabytes < 5000

@@ -1,14 +1,18 @@
-"""What ``mgca-match`` and its subcommands share: exit status, one-line errors, argument types."""
+"""What ``mgca-match`` and its subcommands share: exit status, one-line errors, argument types, the filter's options."""
 
 from __future__ import annotations
 
 import argparse
 import math
 from collections.abc import Callable
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from ..inputs.options import METHODS
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
 
@@ -18,11 +22,52 @@ class UsageError(Exception):
 
 
 class OneLineParser(argparse.ArgumentParser):
-    """argparse without the usage block in front of each error."""
+    """argparse without the usage block in front of each error, and with options that are written out in full.
+
+    Abbreviations would take ``--k`` for ``--keep-precision``.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
 
     def error(self, message: str) -> NoReturn:
         """Raise UsageError."""
         raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = False) -> None:
+    """The options that :func:`filter_options` reads; with ``fit_required`` scores alone are no method."""
+    group = parser.add_argument_group("filter")
+    group.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
+    group.add_argument(
+        "--keep-precision",
+        metavar="P",
+        type=positive(float),
+        help="instead of a threshold: expected share of right ones",
+    )
+    methods = [method for method in METHODS if method != "none" or not fit_required]
+    scores_alone = "" if fit_required else "; none = scores alone"
+    group.add_argument("--method", choices=methods, default="prosac", help=f"robust fit, default prosac{scores_alone}")
+    group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
+    group.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
+    group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
+
+
+def filter_options(options: argparse.Namespace) -> dict[str, Any]:
+    """Options of :class:`mgca_filter.MatchFilter`, as JSON values."""
+    return {
+        "threshold": options.threshold,
+        "keep_precision": options.keep_precision,
+        "method": options.method,
+        "model": None if options.model is None else str(options.model),
+        "providers": options.providers.split(",") if options.providers else None,
+        "seed": options.seed,
+    }
+
+
+def quiet_codecs() -> None:
+    """Keep OpenCV's log of what is wrong with an image off stderr: the command says so itself, in one line."""
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 def intrinsics(text: str) -> NDArray[np.float64]:

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
-from ..images import decode_image
-from ..inputs.options import METHODS
+from ..images import decode_image, intrinsics_doubts
 from ..match_images import match_images
 from .arguments import (
     EXIT_FOUND,
@@ -25,15 +24,27 @@ from .arguments import (
     EXIT_USAGE,
     OneLineParser,
     UsageError,
+    add_filter_options,
+    filter_options,
     intrinsics,
     one_line,
     positive,
+    quiet_codecs,
 )
 from .compare import BaselineFit, comparison_table, fit_baselines
 from .report import MatchReport, picture, summary, to_json, write_npz
 
+_USAGE = """\
+%(prog)s [options] img1 img2
+       %(prog)s colmap DATABASE ...             many pairs: matches of a COLMAP database
+       %(prog)s hloc FEATURES.h5 MATCHES.h5 ... many pairs: matches in hloc's files
+       %(prog)s folder IMAGES ...               many pairs: a folder of images
+       %(prog)s run SCRIPT.py ...               a Python script, with the filter in place of cv2's functions"""
 _EPILOG = """\
-For many images: mgca-match colmap | hloc | folder --help.
+"mgca-match colmap --help", and so on, tells of the other commands.
+
+Pixels are those of the image as it is shown: a photo that its EXIF says to turn is turned first, and --K is for the
+turned one. (mgca-match folder, like COLMAP and hloc, takes photos as they are stored.)
 
 exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
 1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""
@@ -45,6 +56,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The command's arguments."""
     parser = OneLineParser(
         prog="mgca-match",
+        usage=_USAGE,
         description="Match two images and keep the matches that agree with one camera motion.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -65,19 +77,7 @@ def build_parser() -> argparse.ArgumentParser:
     matching = parser.add_argument_group("matching")
     matching.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
     matching.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
-    matching.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
-    matching.add_argument(
-        "--keep-precision",
-        metavar="P",
-        type=positive(float),
-        help="instead of a threshold: expected share of right ones",
-    )
-    matching.add_argument(
-        "--method", choices=METHODS, default="prosac", help="robust fit, default prosac; none = scores alone"
-    )
-    matching.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
-    matching.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
-    matching.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
+    add_filter_options(parser)
     parser.add_argument("--version", action="version", version=f"mgca-match {__version__}")
     return parser
 
@@ -122,6 +122,10 @@ def _match(options: argparse.Namespace) -> MatchReport:
     _check_outputs(options)
     image1, image2 = read_image(options.image1), read_image(options.image2)
     _log.info("%s: %d x %d, %s: %d x %d", options.image1, *image1.shape[1::-1], options.image2, *image2.shape[1::-1])
+    sizes = [(image.shape[1], image.shape[0]) for image in (image1, image2)]
+    for K, of in ((options.K, sizes), (options.K1, sizes[:1]), (options.K2, sizes[1:])):
+        for doubt in [] if K is None else intrinsics_doubts(K, of):
+            _log.warning("warning: %s", doubt)
     start = time.perf_counter()
     matched = match_images(
         image1,
@@ -130,12 +134,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
         max_keypoints=options.max_keypoints,
         K1=K1,
         K2=K2,
-        threshold=options.threshold,
-        keep_precision=options.keep_precision,
-        method=options.method,
-        model=options.model,
-        providers=options.providers.split(",") if options.providers else None,
-        seed=options.seed,
+        **filter_options(options),
     )
     total_ms = 1e3 * (time.perf_counter() - start)
     for assumption in matched.result.info.get("assumptions", ()):
@@ -185,6 +184,7 @@ def main(arguments: Sequence[str]) -> int:
     """Match two images; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
     try:
         options = build_parser().parse_args(arguments)
+        quiet_codecs()
         _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)
         report = _match(options)
         _write(report, options)

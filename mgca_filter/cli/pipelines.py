@@ -11,24 +11,32 @@ from typing import Any
 
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
-from ..inputs.options import METHODS
-from ..pipelines.run import EngineOptions, Summary
+from ..pipelines.run import Summary, Workers
 from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
     EXIT_USAGE,
     OneLineParser,
     UsageError,
+    add_filter_options,
+    filter_options,
     intrinsics,
     one_line,
     positive,
+    quiet_codecs,
 )
 
 _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
 written. A killed run goes on where it stopped when the same command is given again."""
-# The extra that brings a package.
-_EXTRAS = {"pycolmap": "colmap", "h5py": "hloc", "tqdm": "folder", "ray": "ray"}
+_FOLDER_EPILOG = """\
+Pixels are those of the file as it is stored: like COLMAP and hloc, and unlike "mgca-match img1 img2", this command does
+not turn photos as their EXIF says, and --K is for the photo as it is stored.
+
+"""
+# What every command needs, and its own extra brings; and the extras that bring other packages.
+_PACKAGES = ["joblib", "tqdm"]
+_EXTRAS = {"pycolmap": "colmap", "h5py": "hloc", "ray": "ray"}
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -37,7 +45,8 @@ def build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, parser_class=OneLineParser)
     for add in (_add_colmap, _add_hloc, _add_folder):
         command = add(commands)
-        command.epilog, command.formatter_class = _EPILOG, argparse.RawDescriptionHelpFormatter
+        command.epilog = _FOLDER_EPILOG + _EPILOG if add is _add_folder else _EPILOG
+        command.formatter_class = argparse.RawDescriptionHelpFormatter
         _add_common(command)
     return parser
 
@@ -90,24 +99,13 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
 
 
 def _add_common(command: argparse.ArgumentParser) -> None:
-    group = command.add_argument_group("filter")
-    group.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
-    fits = [method for method in METHODS if method != "none"]
-    group.add_argument("--method", choices=fits, default="prosac", help="robust fit, default prosac")
-    group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
-    group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
+    add_filter_options(command, fit_required=True)
     workers = command.add_argument_group("workers")
     workers.add_argument("-j", "--jobs", metavar="N", type=positive(int), default=1, help="workers, default 1")
     workers.add_argument("--engine", choices=("local", "ray"), default="local", help="processes here (default), or Ray")
     workers.add_argument("--address", metavar="HOST", help='of a Ray cluster ("auto" = this machine\'s)')
     command.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary, errors only")
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
-
-
-def _filter_options(options: argparse.Namespace) -> dict[str, Any]:
-    """Options of the filter, as JSON values: they are part of what a resumed run must have in common."""
-    model = None if options.model is None else str(options.model)
-    return {"threshold": options.threshold, "method": options.method, "model": model, "seed": options.seed}
 
 
 def _check_output(options: argparse.Namespace, output: Path, inputs: Sequence[Path]) -> None:
@@ -131,9 +129,9 @@ def _run_colmap(options: argparse.Namespace) -> Summary:
     if options.truth is not None and not options.compare:
         raise UsageError("--truth goes with --compare")
     job = ColmapJob(options.database, output, use_descriptors=not options.no_descriptors)
-    summary = _with_engine(job, options)
+    summary = _with_workers(job, options)
     if options.compare:
-        from ..pipelines.colmap_compare import compare, comparison_table
+        from ..pipelines.mapper_comparison import compare, comparison_table
 
         print(comparison_table(compare(output, summary.seconds, options.truth, options.jobs)))
     return summary
@@ -144,17 +142,16 @@ def _run_hloc(options: argparse.Namespace) -> Summary:
 
     _check_output(options, options.output, [options.features, options.matches])
     job = HlocJob(options.features, options.matches, options.output, use_descriptors=not options.no_descriptors)
-    return _with_engine(job, options)
+    return _with_workers(job, options)
 
 
 def _run_folder(options: argparse.Namespace) -> Summary:
-    from ..pipelines.folder import OUTPUTS, FolderJob
-    from ..pipelines.folder_pairs import exhaustive_pairs, list_images, read_pairs, sequential_pairs
+    from ..pipelines.folder import OUTPUTS, FolderJob, exhaustive_pairs, list_images, read_pairs, sequential_pairs
 
     if options.output.suffix not in OUTPUTS:
         raise UsageError(f"{options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
     _check_output(options, options.output, [])
-    import_module(OUTPUTS[options.output.suffix])  # better missed now than when all pairs are done
+    import_module(OUTPUTS[options.output.suffix])
     names = list_images(options.images)
     if options.pairs == "exhaustive":
         pairs = exhaustive_pairs(names)
@@ -173,19 +170,16 @@ def _run_folder(options: argparse.Namespace) -> Summary:
         options.max_keypoints,
         options.cache,
     )
-    return _with_engine(job, options)
+    return _with_workers(job, options)
 
 
-def _with_engine(job: Any, options: argparse.Namespace) -> Summary:
+def _with_workers(job: Any, options: argparse.Namespace) -> Summary:
     if options.address is not None and options.engine != "ray":
         raise UsageError("--address goes with --engine ray")
-    filter_options = _filter_options(options)
-    engine = EngineOptions(options.engine, options.jobs, options.address).open(filter_options)
-    try:
-        summary: Summary = job.run(engine, filter_options, options.quiet)
-    finally:
-        engine.close()
-    for message in summary.failures:
+    settings = filter_options(options)
+    with Workers(settings, options.jobs, options.engine, options.address) as workers:
+        summary: Summary = job.run(workers, settings, options.quiet)
+    for message in [*summary.failures, *([] if options.quiet else summary.doubts)]:
         print(f"mgca-match: {message}", file=sys.stderr)
     if not options.quiet:
         print(summary)
@@ -196,9 +190,12 @@ def main(arguments: Sequence[str]) -> int:
     """Run a subcommand; returns the exit status (0 = geometry found, 1 = for no pair, 2 = usage or files)."""
     try:
         options = build_parser().parse_args(arguments)
+        quiet_codecs()
+        for package in _PACKAGES + (["ray"] if options.engine == "ray" else []):
+            import_module(package)  # better missed now than when all pairs are done
         summary = options.run(options)
     except ImportError as error:
-        extra = _EXTRAS.get(error.name or "")
+        extra = options.command if error.name in _PACKAGES else _EXTRAS.get(error.name or "")
         hint = f"; pip install 'mgca_filter[{extra}]' brings it" if extra else ""
         print(f"mgca-match: {one_line(error)}{hint}", file=sys.stderr)
         return EXIT_USAGE

@@ -1,4 +1,4 @@
-"""COLMAP databases: keypoints and matches in, ``two_view_geometries`` out.
+"""COLMAP databases: keypoints and matches in, ``two_view_geometries`` out; or a new database from features and rows.
 
 COLMAP puts the centre of the top-left pixel at (0.5, 0.5); everything here is shifted to (0, 0) on the way in and back
 on the way out.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 import sqlite3
-from collections.abc import Iterable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,12 +21,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from .engines import Engine
-from .journal import Journal, PipelineError, output_file, sqlite_errors
-from .run import Summary, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow
+from .journal import Journal, PipelineError, output_file
+from .run import Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import ImageFeatures, PairRow, Unusable
 
 HALF_PIXEL = 0.5
+# COLMAP's own guess for a camera of which nothing is known.
+_GUESSED_FOCAL_FACTOR = 1.2
 # Named in the sqlite3 module from Python 3.11 on.
 _SQLITE_BUSY, _SQLITE_LOCKED = 5, 6
 # Pixels of COLMAP to pixels of OpenCV, homogeneous.
@@ -55,7 +57,7 @@ class ColmapJob:
     output: Path
     use_descriptors: bool = True
 
-    def run(self, engine: Engine, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
+    def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
 
         Raises:
@@ -64,17 +66,19 @@ class ColmapJob:
         if not self.database.is_file():
             raise PipelineError(f"{self.database}: no such database")
         work = work_folder(self.output)
-        journal = Journal(work / "journal.db")
+        journal = Journal(work / "journal.log")
         copy = work / "copy.db"
         try:
             for leftover in work.glob("copy.db*"):
                 leftover.unlink()
             copy_database(self.database, copy)
             with closing(open_database(copy, self.database)) as database:
-                content = {"content": content_digest(copy), "descriptors": self.use_descriptors}
+                with _damage(self.database):
+                    content = {"content": content_digest(copy), "descriptors": self.use_descriptors}
+                    source = DatabaseSource(database, self.use_descriptors)
                 journal.begin({**content, **run_identity(filter_options)})
-                summary = run_pairs(DatabaseSource(database, self.use_descriptors), engine, journal, quiet)
-                write_geometries(database, journal.rows())
+                summary = run_pairs(source, workers, journal, quiet)
+                write_geometries(database, source.ids, journal.rows())
             self._deliver(copy)
         finally:
             journal.close()
@@ -98,11 +102,11 @@ def copy_database(source: Path, target: Path) -> None:
     # Even to read, SQLite wants to write a log beside the file; where the folder forbids that, nobody else writes.
     mode = "mode=rw" if os.access(source.resolve().parent, os.W_OK) else "immutable=1"
     with (
-        sqlite_errors(source),
+        _sqlite_errors(source),
         closing(sqlite3.connect(f"{source.resolve().as_uri()}?{mode}", timeout=1.0, uri=True)) as reader,
     ):
         reader.execute("SELECT COUNT(*) FROM sqlite_master")
-        with sqlite_errors(target), closing(sqlite3.connect(target, timeout=1.0)) as writer:
+        with _sqlite_errors(target), closing(sqlite3.connect(target, timeout=1.0)) as writer:
             reader.backup(writer, progress=_raise_when_locked)
 
 
@@ -112,24 +116,60 @@ def _raise_when_locked(status: int, remaining: int, total: int) -> None:
         raise sqlite3.OperationalError("database is locked")
 
 
+@contextmanager
+def _sqlite_errors(path: Path) -> Iterator[None]:
+    """SQLite's exceptions as one line that names the file: locked, full, or broken."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        words = str(error)
+        if "locked" in words or "busy" in words:
+            words = "locked by another process"
+        elif "full" in words or "disk I/O" in words:
+            words = "cannot be written, the disk is full; what is finished is kept, run the command again to go on"
+        raise PipelineError(f"{path}: {words}") from error
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    """What SQLite and pycolmap say of a database that holds what cannot be, as one line that names the file."""
+    try:
+        with _sqlite_errors(path):
+            yield
+    except (RuntimeError, ValueError) as error:
+        raise PipelineError(f"{path}: a damaged database, or one of another version ({_reason(error)})") from error
+
+
+def _reason(error: Exception) -> str:
+    """What pycolmap says, without its place in the source and on one line."""
+    return re.sub(r"^\[\S+\] ", "", " ".join(str(error).split()))
+
+
 def open_database(path: Path, name: Path | None = None) -> Any:
     """``pycolmap.Database`` of an existing file; ``name`` is what messages call it.
 
     Raises:
-        PipelineError: it is none of COLMAP's.
+        PipelineError: it is none of COLMAP's, or damaged.
     """
-    with closing(sqlite3.connect(path)) as plain:
+    with _damage(name or path), closing(sqlite3.connect(path)) as plain:
         tables = {name for (name,) in plain.execute("SELECT name FROM sqlite_master WHERE type='table'")}
     missing = {"cameras", "images", "keypoints", "descriptors", "matches"} - tables
     if missing:
         raise PipelineError(f"{name or path}: not a COLMAP database, tables missing: {', '.join(sorted(missing))}")
-    return pycolmap.Database.open(path)
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # its warning of what it raises all the same
+    try:
+        with _damage(name or path):
+            return pycolmap.Database.open(path)
+    finally:
+        pycolmap.logging.minloglevel = level
 
 
 def content_digest(path: Path) -> str:
     """Digest of what the filter reads of a database; opening one changes its time, and even its bytes."""
     digest = hashlib.blake2b(digest_size=16)
     with closing(sqlite3.connect(path)) as database:
+        database.text_factory = bytes  # names need not be UTF-8
         for table in ("cameras", "images", "keypoints", "descriptors", "matches"):
             for row in database.execute(f"SELECT * FROM {table} ORDER BY 1"):
                 for value in row:
@@ -138,35 +178,54 @@ def content_digest(path: Path) -> str:
 
 
 class DatabaseSource:
-    """The pairs of a database that have matches."""
+    """The pairs of a database that have matches.
+
+    A pair or image whose rows cannot be used costs its own pairs only.
+
+    Attributes:
+        ids: id of the image of each name; bytes of a name that are not UTF-8 are written as in Python, ``\\xdf``.
+    """
 
     def __init__(self, database: Any, use_descriptors: bool) -> None:
         self._database = database
         self._use_descriptors = use_descriptors
-        self._cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
-        self._images = {image.name: image for image in database.read_all_images()}
+        images = database.read_all_images()
+        names = {image.image_id: _name(image) for image in images}
+        self.ids = {name: image_id for image_id, name in names.items()}
+        self._cameras = {names[image.image_id]: image.camera_id for image in images}
+        pair_ids, _ = database.read_num_matches()
+        id_pairs = sorted(pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
+        self._pairs = [(names[id1], names[id2]) for id1, id2 in id_pairs if id1 in names and id2 in names]
 
     def pairs(self) -> Sequence[tuple[str, str]]:
         """Names of the images, that of the smaller id first, as COLMAP's pair ids order them."""
-        names = {image.image_id: name for name, image in self._images.items()}
-        pair_ids, _ = self._database.read_num_matches()
-        id_pairs = sorted(pycolmap.pair_id_to_image_pair(pair_id) for pair_id in pair_ids)
-        return [(names[id1], names[id2]) for id1, id2 in id_pairs if id1 in names and id2 in names]
+        return self._pairs
 
-    def image(self, name: str) -> ImageFeatures | None:
-        """Keypoints freed of distortion; None for a camera without an image plane (a spherical one)."""
-        image = self._images[name]
-        camera = self._cameras[image.camera_id]
-        if camera.is_spherical():
-            return None
-        table = self._database.read_keypoints(image.image_id)
+    def image(self, name: str) -> ImageFeatures | Unusable:
+        """Keypoints freed of distortion, where the image's camera has an image plane."""
+        camera_id = self._cameras[name]
+        try:
+            if not self._database.exists_camera(camera_id):
+                return Unusable(f"{name}: its camera {camera_id} is not in the database")
+            camera = self._database.read_camera(camera_id)
+            if camera.is_spherical():
+                return Unusable(f"{name}: its camera {camera_id} is spherical, it has no image plane")
+            K = _TO_OPENCV @ camera.calibration_matrix()
+            if not (np.isfinite(camera.params).all() and K[0, 0] > 0 and K[1, 1] > 0):
+                return Unusable(f"{name}: its camera {camera_id} has parameters {camera.params_to_string()}")
+            return self._features(camera, self.ids[name], K)
+        except (RuntimeError, ValueError) as error:
+            return Unusable(f"{name}: {_reason(error)}")
+
+    def _features(self, camera: Any, image_id: int, K: NDArray[np.float64]) -> ImageFeatures:
+        table = self._database.read_keypoints(image_id)
         size, angle = keypoint_shapes(table)
         return ImageFeatures(
             undistorted(camera, table[:, :2]),
             size,
             angle,
-            self._sift_descriptors(image.image_id, len(table)),
-            _TO_OPENCV @ camera.calibration_matrix() if camera.has_prior_focal_length else None,
+            self._sift_descriptors(image_id, len(table)),
+            K if camera.has_prior_focal_length else None,
             (camera.width, camera.height),
         )
 
@@ -178,11 +237,21 @@ class DatabaseSource:
         is_sift = descriptors.type == pycolmap.FeatureExtractorType.SIFT and len(descriptors.data) == count
         return np.asarray(descriptors.data, np.uint8) if is_sift else None
 
-    def matches(self, name1: str, name2: str) -> NDArray[Any]:
+    def matches(self, name1: str, name2: str) -> NDArray[Any] | Unusable:
         """Matches (M, 2) as the database holds them."""
-        id1, id2 = (self._images[name].image_id for name in (name1, name2))
-        matches: NDArray[Any] = self._database.read_matches(id1, id2)
+        try:
+            matches: NDArray[Any] = self._database.read_matches(self.ids[name1], self.ids[name2])
+        except (RuntimeError, ValueError) as error:
+            return Unusable(f"{name1} with {name2}: {_reason(error)}")
         return matches
+
+
+def _name(image: Any) -> str:
+    """Name of an image; pycolmap refuses to read one that is not UTF-8."""
+    try:
+        return str(image.name)
+    except UnicodeDecodeError as error:
+        return error.object.decode("utf-8", "backslashreplace")
 
 
 def undistorted(camera: Any, points: NDArray[Any]) -> NDArray[np.float64]:
@@ -210,13 +279,12 @@ def keypoint_shapes(table: NDArray[Any]) -> tuple[NDArray[Any] | None, NDArray[A
     return 2.0 * scale, np.degrees(orientation) % 360.0
 
 
-def write_geometries(database: Any, rows: Iterable[PairRow]) -> None:
-    """Replace all two-view geometries of an open database.
+def write_geometries(database: Any, ids: dict[str, int], rows: Iterable[PairRow]) -> None:
+    """Replace all two-view geometries of an open database; ``ids`` of its images by name.
 
     Raises:
         PipelineError: the disk is full.
     """
-    ids = {image.name: image.image_id for image in database.read_all_images()}
     try:
         with pycolmap.DatabaseTransaction(database):
             database.clear_two_view_geometries()
@@ -244,3 +312,78 @@ def two_view_geometry(row: PairRow) -> Any:
         geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(row.R), translation)
         geometry.E = row.E
     return geometry
+
+
+def write_database(
+    path: Path,
+    names: Sequence[str],
+    read: Callable[[str], ImageFeatures | None],
+    rows: Iterable[PairRow],
+    K: NDArray[np.float64] | None,
+) -> None:
+    """Cameras, images, keypoints, descriptors where they are bytes long, kept matches and two-view geometries.
+
+    Args:
+        path: the file to make. names: images; those that ``read`` has no features for are left out.
+        K: (3, 3) intrinsics in OpenCV's pixels of one pinhole camera for all images of a size, or None: one
+            SIMPLE_RADIAL camera per image, of guessed focal length.
+
+    Raises:
+        PipelineError: the disk is full.
+    """
+    try:
+        with closing(pycolmap.Database.open(path)) as database:
+            with pycolmap.DatabaseTransaction(database):
+                ids = _write_images(database, names, read, K)
+            write_geometries(database, ids, _with_matches(database, ids, rows))
+    except (RuntimeError, ValueError) as error:
+        raise PipelineError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
+
+
+def _write_images(
+    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], K: NDArray[np.float64] | None
+) -> dict[str, int]:
+    ids: dict[str, int] = {}
+    cameras: dict[tuple[int, int], int] = {}
+    for name in names:
+        image = read(name)
+        if image is None or image.image_size is None:
+            continue
+        if K is None or image.image_size not in cameras:
+            cameras[image.image_size] = database.write_camera(_camera(image.image_size, K))
+        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[image.image_size]))
+        table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
+        database.write_keypoints(ids[name], table.astype(np.float32))
+        if image.descriptors is not None and image.descriptors.shape[1:] == (128,):
+            data = image.descriptors.astype(np.uint8)  # OpenCV's SIFT: integers 0 … 255 as float32
+            database.write_descriptors(
+                ids[name], pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=data)
+            )
+    return ids
+
+
+def _scale(image: ImageFeatures) -> NDArray[Any]:
+    return np.ones(len(image.points)) if image.size is None else image.size
+
+
+def _angle(image: ImageFeatures) -> NDArray[Any]:
+    return np.zeros(len(image.points)) if image.angle is None else image.angle
+
+
+def _camera(size: tuple[int, int], K: NDArray[np.float64] | None) -> Any:
+    width, height = size
+    if K is None:
+        params = [_GUESSED_FOCAL_FACTOR * max(size), width / 2, height / 2, 0.0]
+        return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
+    params = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
+    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    camera.has_prior_focal_length = True
+    return camera
+
+
+def _with_matches(database: Any, ids: dict[str, int], rows: Iterable[PairRow]) -> Iterator[PairRow]:
+    """The rows whose images are in the database, each after its kept matches were written."""
+    for row in rows:
+        if row.name1 in ids and row.name2 in ids:
+            database.write_matches(ids[row.name1], ids[row.name2], row.kept)
+            yield row

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from .engines import Engine
 from .journal import file_stamp, output_file
-from .run import progress_bar
+from .run import Workers, progress_bar
 from .worker import ImageFeatures
 
 
@@ -31,7 +30,7 @@ class FeatureCache:
     detector: str
     max_keypoints: int
 
-    def fill(self, names: Sequence[str], engine: Engine, quiet: bool = False) -> list[str]:
+    def fill(self, names: Sequence[str], workers: Workers, quiet: bool = False) -> list[str]:
         """Extract what is missing; returns the images that cannot be read or decoded."""
         self.folder.mkdir(parents=True, exist_ok=True)
         missing = [name for name in names if not self._path(name).is_file()]
@@ -42,7 +41,7 @@ class FeatureCache:
                 yield name, _bytes_or_none(self.images / name), self.detector, self.max_keypoints
 
         with progress_bar("images", len(names), len(names) - len(missing), quiet) as bar:
-            for name, features in engine.map("extract", tasks()):
+            for name, features in workers.map("extract", tasks()):
                 if features is None:
                     unreadable.append(name)
                 else:

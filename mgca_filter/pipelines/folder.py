@@ -5,40 +5,101 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .engines import Engine
+from ..images import intrinsics_doubts
 from .feature_cache import FeatureCache
-from .journal import Journal, output_file
-from .run import Summary, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow
+from .journal import Journal, PipelineError, output_file
+from .run import Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import ImageFeatures, PairRow, Unusable
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
+SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".jp2"))
 # Kinds of output, and the module that writing one needs.
 OUTPUTS = {".db": "pycolmap", ".h5": "h5py", ".jsonl": "json"}
 
 
+def list_images(folder: Path) -> list[str]:
+    """Paths of the images below ``folder``, relative to it, with "/", sorted.
+
+    Raises:
+        PipelineError: no such folder, or no images in it.
+    """
+    if not folder.is_dir():
+        raise PipelineError(f"{folder}: no such folder")
+    files = (path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES and path.is_file())
+    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    if not names:
+        raise PipelineError(f"{folder}: no images ({', '.join(sorted(SUFFIXES))})")
+    return names
+
+
+def exhaustive_pairs(names: Sequence[str]) -> list[tuple[str, str]]:
+    """Every image with every other."""
+    return list(combinations(names, 2))
+
+
+def sequential_pairs(names: Sequence[str], overlap: int) -> list[tuple[str, str]]:
+    """Every image with the ``overlap`` next ones."""
+    return [(name, later) for k, name in enumerate(names) for later in names[k + 1 : k + 1 + overlap]]
+
+
+def read_pairs(path: Path, names: Sequence[str], folder: Path) -> list[tuple[str, str]]:
+    """Pairs of a text file, one a line: two names, separated by a tab (for names with spaces) or by blanks.
+
+    Empty lines and lines that begin with # are skipped, pairs that are there before in either order too.
+
+    Raises:
+        PipelineError: the file cannot be read, a line has not two names, or names an image that ``names`` lacks.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PipelineError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from error
+    known, pairs = set(names), dict[frozenset[str], tuple[str, str]]()
+    for number, line in enumerate(lines, 1):
+        words = [word.strip() for word in line.split("\t")] if "\t" in line else line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        if len(words) != 2 or words[0] == words[1]:
+            raise PipelineError(f"{path}:{number}: expected two names of images, got {line.strip()!r}")
+        for word in words:
+            if word not in known:
+                raise PipelineError(f"{path}:{number}: {word} is not in {folder}")
+        pairs.setdefault(frozenset(words), (words[0], words[1]))
+    return list(pairs.values())
+
+
 @dataclass(frozen=True)
 class FolderSource:
-    """Pairs of images whose features lie in a cache; one camera for all images, or none."""
+    """Pairs of images whose features lie in a cache; one camera for all images, or none.
+
+    ``sizes`` (width, height) are those of the images that were read.
+    """
 
     cache: FeatureCache
     pair_names: Sequence[tuple[str, str]]
     K: NDArray[np.float64] | None
+    sizes: set[tuple[int, int]] = field(default_factory=set)
 
     def pairs(self) -> Sequence[tuple[str, str]]:
         """Names of the images, relative to their folder."""
         return self.pair_names
 
-    def image(self, name: str) -> ImageFeatures | None:
-        """Features from the cache; None for an image that could not be read."""
+    def image(self, name: str) -> ImageFeatures | Unusable:
+        """Features from the cache."""
         features = self.cache.read(name)
-        return None if features is None else replace(features, K=self.K)
+        if features is None:
+            return Unusable(f"{name}: no features, the image cannot be read")
+        if features.image_size is not None:
+            self.sizes.add(features.image_size)
+        return replace(features, K=self.K)
 
     def matches(self, name1: str, name2: str) -> None:
         """None: nearest neighbours of the descriptors."""
@@ -65,14 +126,14 @@ class FolderJob:
     max_keypoints: int = 2000
     cache: Path | None = None
 
-    def run(self, engine: Engine, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
+    def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Extract what the cache lacks, filter all pairs, write the output; a killed run goes on where it stopped.
 
         Raises:
             PipelineError: the output cannot be written.
         """
         work = work_folder(self.output)
-        journal = Journal(work / "journal.db")
+        journal = Journal(work / "journal.log")
         features = {"detector": self.detector, "max_keypoints": self.max_keypoints}
         camera = {"K": None if self.K is None else self.K.tolist()}
         try:
@@ -80,24 +141,25 @@ class FolderJob:
             journal.begin({**folder, **features, **camera, **run_identity(filter_options)})
             cache = FeatureCache(self.cache or work / "features", self.images, self.detector, self.max_keypoints)
             names = sorted({name for pair in self.pairs for name in pair})
-            cache.fill(names, engine, quiet)
-            summary = run_pairs(FolderSource(cache, self.pairs, self.K), engine, journal, quiet)
+            cache.fill(names, workers, quiet)
+            source = FolderSource(cache, self.pairs, self.K)
+            summary = run_pairs(source, workers, journal, quiet)
             self._write(names, cache.read, journal)
         finally:
             journal.close()
         shutil.rmtree(work)
-        return summary
+        return summary if self.K is None else replace(summary, doubts=intrinsics_doubts(self.K, source.sizes))
 
     def _write(self, names: Sequence[str], read: ReadFeatures, journal: Journal) -> None:
         wanted = set(self.pairs)
         rows = (row for row in journal.rows() if (row.name1, row.name2) in wanted)
         with output_file(self.output) as partial:
             if self.output.suffix == ".db":
-                from .colmap_writer import write_database
+                from .colmap import write_database
 
                 write_database(partial, names, read, rows, self.K)
             elif self.output.suffix == ".h5":
-                from .hloc_writer import write_features, write_matches
+                from .hloc import write_features, write_matches
 
                 with output_file(self.output.with_suffix(".features.h5")) as partial_features:
                     write_features(partial_features, names, read)

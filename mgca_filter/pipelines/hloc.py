@@ -1,4 +1,5 @@
-"""hloc's files: ``features.h5`` and ``matches.h5`` in, a filtered ``matches.h5`` out.
+"""hloc's files: ``features.h5`` and ``matches.h5`` in, a filtered ``matches.h5`` out; or new ones from features and
+rows.
 
 Layout (hloc/utils/io.py and parsers.py): features lie in one group per image name, with ``keypoints`` (N, 2) in
 OpenCV's pixels and, as the extractor gives them, ``descriptors`` (D, N), ``scales``, ``oris`` (degrees) and
@@ -9,7 +10,7 @@ a name turned into "-", with ``matches0`` (N1,), −1 = none, and ``matching_sco
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +20,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from .engines import Engine
 from .journal import Journal, PipelineError, file_stamp, output_file
-from .run import Summary, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow
+from .run import Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import FAILED, ImageFeatures, PairRow, Unusable
 
 _SIFT_LENGTH = 128
 
@@ -42,7 +42,7 @@ class HlocJob:
     output: Path
     use_descriptors: bool = True
 
-    def run(self, engine: Engine, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
+    def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
 
         Raises:
@@ -52,10 +52,10 @@ class HlocJob:
             source = HlocSource(features, matches, self.use_descriptors)
             work = work_folder(self.output)
             inputs = {str(path.resolve()): file_stamp(path) for path in (self.features, self.matches)}
-            journal = Journal(work / "journal.db")
+            journal = Journal(work / "journal.log")
             try:
                 journal.begin({"inputs": inputs, "descriptors": self.use_descriptors, **run_identity(filter_options)})
-                summary = run_pairs(source, engine, journal, quiet)
+                summary = run_pairs(source, workers, journal, quiet)
                 with output_file(self.output) as partial:
                     shutil.copyfile(self.matches, partial)
                     with h5py.File(partial, "r+") as filtered:
@@ -113,9 +113,14 @@ class HlocSource:
         """Names of the images in the order of the pair's group."""
         return sorted(self.groups)
 
-    def image(self, name: str) -> ImageFeatures:
+    def image(self, name: str) -> ImageFeatures | Unusable:
         """Features of an image; descriptors where they are SIFT's, which come with scale and orientation."""
-        group = self._features[name]
+        try:
+            return self._image(self._features[name])
+        except (OSError, ValueError, TypeError) as error:
+            return Unusable(f"{self._features.filename}: {name} cannot be read ({' '.join(str(error).split())})")
+
+    def _image(self, group: Any) -> ImageFeatures:
         points = group["keypoints"][()].astype(np.float64)
         scale, angle = (group[key][()] if key in group else None for key in ("scales", "oris"))
         descriptors = None
@@ -127,9 +132,13 @@ class HlocSource:
         image_size = tuple(int(side) for side in group["image_size"][()]) if "image_size" in group else None
         return ImageFeatures(points, size, angle, descriptors, None, image_size)  # type: ignore[arg-type]
 
-    def matches(self, name1: str, name2: str) -> NDArray[Any]:
+    def matches(self, name1: str, name2: str) -> NDArray[Any] | Unusable:
         """Matches (M, 2) of a pair."""
-        partner = self._matches[self.groups[name1, name2]]["matches0"][()]
+        group = self.groups[name1, name2]
+        try:
+            partner = self._matches[group]["matches0"][()]
+        except OSError as error:
+            return Unusable(f"{self._matches.filename}: {group} cannot be read ({' '.join(str(error).split())})")
         rows = np.flatnonzero(partner > -1)
         return np.stack([rows, partner[rows].astype(np.intp)], axis=1)
 
@@ -168,3 +177,32 @@ def drop_matches(matches: Any, groups: dict[tuple[str, str], str], rows: Iterabl
         if "matching_scores0" in group:
             scores = group["matching_scores0"][()]
             group["matching_scores0"][...] = np.where(dropped, 0, scores).astype(scores.dtype)
+
+
+def write_features(path: Path, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> None:
+    """Keypoints, scales, orientations (degrees), descriptors and image size of each image that has features."""
+    with h5py.File(path, "w") as file:
+        for name in names:
+            image = read(name)
+            if image is None or image.size is None or image.angle is None or image.descriptors is None:
+                continue
+            group = file.create_group(name)
+            group["keypoints"] = image.points.astype(np.float32)
+            group["scales"], group["oris"] = image.size / 2, image.angle
+            group["descriptors"] = np.ascontiguousarray(image.descriptors.T)
+            group["image_size"] = np.array(image.image_size)
+
+
+def write_matches(path: Path, read: Callable[[str], ImageFeatures | None], rows: Iterable[PairRow]) -> None:
+    """Kept matches and their scores of each pair, in the new layout; failed pairs are left out."""
+    with h5py.File(path, "w") as file:
+        for row in rows:
+            image = None if row.status == FAILED else read(row.name1)
+            if image is None:
+                continue
+            count = len(image.points)
+            partner, scores = np.full(count, -1, np.int32), np.zeros(count, np.float16)
+            partner[row.kept[:, 0]] = row.kept[:, 1]
+            scores[row.kept[:, 0]] = row.scores
+            group = file.create_group("/".join(name.replace("/", "-") for name in (row.name1, row.name2)))
+            group["matches0"], group["matching_scores0"] = partner, scores

@@ -1,29 +1,29 @@
-"""What a run has finished, row by row on disk; and output that appears whole or not at all."""
+"""What a run has finished, pair by pair on disk; and output that appears whole or not at all."""
 
 from __future__ import annotations
 
 import json
-import sqlite3
+import os
+import struct
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..atomic_file import replaced_when_done
 from ..errors import MgcaFilterError
 from .worker import PairRow
 
-_SCHEMA = """
-CREATE TABLE IF NOT EXISTS job (description TEXT NOT NULL);
-CREATE TABLE IF NOT EXISTS pair_rows (
-    name1 TEXT, name2 TEXT, status TEXT, num_matches INTEGER, num_kept INTEGER, calibrated INTEGER,
-    kept BLOB, scores BLOB, E BLOB, F BLOB, H BLOB, R BLOB, t BLOB, message TEXT,
-    PRIMARY KEY (name1, name2));
-"""
-_SHAPES = {"E": (3, 3), "F": (3, 3), "H": (3, 3), "R": (3, 3), "t": (3,)}
+# The file: these bytes, then records. A record is the length and the CRC-32 of what follows them, a line of JSON, and
+# the bytes of the arrays that the line names. The first record is the description of the run, each other one a pair.
+_MAGIC = b"mgca_filter journal 1\n"
+_HEAD = struct.Struct("<II")
+_ARRAYS = {"kept": "<u4", "scores": "<f4", "E": "<f8", "F": "<f8", "H": "<f8", "R": "<f8", "t": "<f8"}
+_MAX_FAILURES = 5
+_PLAIN = ("name1", "name2", "status", "num_matches", "calibrated", "message")
 
 
 class PipelineError(MgcaFilterError):
@@ -31,12 +31,17 @@ class PipelineError(MgcaFilterError):
 
 
 class Journal:
-    """Rows of the pairs that are done, in an SQLite file that survives ``kill -9`` at any moment.
+    """Rows of the pairs that are done: a log that only grows, and survives ``kill -9`` at any moment.
 
-    Each row is committed when it is added. The file is locked while it is open.
+    Each row is handed to the system when it is added. A last record that a killed run or a full disk left torn is
+    dropped when the file is opened, with whatever follows a damaged one. The file is locked while it is open.
 
     Args:
         path: the file; made when it does not exist.
+
+    Attributes:
+        statistics: by status, how many pairs, matches in and matches kept.
+        failures: distinct messages of failed pairs, the first few of them in order.
 
     Raises:
         PipelineError: another run has the file open, it is no journal, or the disk is full; from every method.
@@ -44,12 +49,21 @@ class Journal:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with sqlite_errors(path):
-            self._db = sqlite3.connect(path, timeout=1.0, isolation_level=None)
-            self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
-            self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA synchronous=NORMAL")
-            self._db.executescript(_SCHEMA)
+        self.statistics: dict[str, tuple[int, int, int]] = {}
+        self.failures: list[str] = []
+        self._offsets: dict[tuple[str, str], int] = {}
+        self._description: dict[str, Any] | None = None
+        with _disk_errors(path):
+            self._file = path.open("a+b", buffering=0)
+            try:
+                _lock(self._file, path)
+                self._end = self._read_all()
+                self._file.truncate(self._end)
+                if self._end == 0:
+                    self._append(_MAGIC)
+            except BaseException:
+                self._file.close()
+                raise
 
     def begin(self, description: dict[str, Any]) -> None:
         """Start, or go on with, the run that ``description`` determines (input and options, as JSON values).
@@ -57,67 +71,119 @@ class Journal:
         Raises:
             PipelineError: the journal holds rows of another description.
         """
-        wanted = json.dumps(description, sort_keys=True)
-        with sqlite_errors(self.path):
-            found = self._db.execute("SELECT description FROM job").fetchone()
-            if found is None:
-                self._db.execute("INSERT INTO job VALUES (?)", (wanted,))
-        if found is not None and found[0] != wanted:
-            difference = _difference(found[0], wanted)
+        wanted = json.loads(json.dumps(description))
+        if self._description is None:
+            self._append(_record(wanted))
+            self._description = wanted
+        elif self._description != wanted:
+            difference = _difference(self._description, wanted)
             raise PipelineError(f"{self.path.parent}: left by a run with {difference}; delete it or resume that run")
 
     def __contains__(self, pair: tuple[str, str]) -> bool:
-        with sqlite_errors(self.path):
-            return self._db.execute("SELECT 1 FROM pair_rows WHERE name1=? AND name2=?", pair).fetchone() is not None
+        return pair in self._offsets
 
     def add(self, row: PairRow) -> None:
-        """Write one row; it is there when this returns."""
-        blobs = [None if (m := getattr(row, name)) is None else m.astype("<f8").tobytes() for name in _SHAPES]
-        kept, scores = row.kept.astype("<u4").tobytes(), row.scores.astype("<f4").tobytes()
-        values = (row.name1, row.name2, row.status, row.num_matches, len(row.kept), row.calibrated, kept, scores)
-        with sqlite_errors(self.path):
-            self._db.execute(
-                "INSERT OR REPLACE INTO pair_rows VALUES (?,?,?,?,?,?,?,?,?,?,?,?,?,?)", (*values, *blobs, row.message)
-            )
+        """Write the row of a pair that is not there yet; it outlives this process when this returns."""
+        arrays = {name: value for name in _ARRAYS if (value := getattr(row, name)) is not None}
+        head = {name: getattr(row, name) for name in _PLAIN} | {"arrays": {n: a.shape for n, a in arrays.items()}}
+        offset = self._end
+        self._append(_record(head, b"".join(a.astype(_ARRAYS[n]).tobytes() for n, a in arrays.items())))
+        self._count(offset, head)
 
     def rows(self) -> Iterator[PairRow]:
         """All rows, sorted by the names of the images."""
-        with sqlite_errors(self.path):
-            for values in self._db.execute("SELECT * FROM pair_rows ORDER BY name1, name2"):
-                name1, name2, status, num_matches, _, calibrated, kept, scores, *matrices, message = values
-                yield PairRow(
-                    name1,
-                    name2,
-                    status,
-                    num_matches,
-                    np.frombuffer(kept, "<u4").reshape(-1, 2),
-                    np.frombuffer(scores, "<f4"),
-                    bool(calibrated),
-                    **{name: _matrix(blob, _SHAPES[name]) for name, blob in zip(_SHAPES, matrices)},
-                    message=message,
-                )
-
-    def statistics(self) -> dict[str, tuple[int, int, int]]:
-        """Pairs, matches in and matches kept by status."""
-        query = (
-            "SELECT status, COUNT(*), SUM(num_matches), SUM(num_kept) FROM pair_rows GROUP BY status ORDER BY 2 DESC"
-        )
-        with sqlite_errors(self.path):
-            return {status: (pairs, given, kept) for status, pairs, given, kept in self._db.execute(query)}
-
-    def failures(self, limit: int) -> list[str]:
-        """Distinct messages of failed pairs, at most ``limit``."""
-        query = "SELECT DISTINCT message FROM pair_rows WHERE message != '' ORDER BY 1 LIMIT ?"
-        with sqlite_errors(self.path):
-            return [message for (message,) in self._db.execute(query, (limit,))]
+        with _disk_errors(self.path):
+            for pair in sorted(self._offsets):
+                self._file.seek(self._offsets[pair])
+                payload = self._read_record(self._end)
+                if payload is None:
+                    raise PipelineError(f"{self.path}: damaged while it was open")
+                yield _row(payload)
 
     def close(self) -> None:
         """Release the file."""
-        self._db.close()
+        self._file.close()
+
+    def _read_all(self) -> int:
+        """Take in every whole record; returns where the last of them ends, 0 for a new file."""
+        size = self._file.seek(0, os.SEEK_END)
+        self._file.seek(0)
+        magic = self._file.read(len(_MAGIC)) or b""
+        if not _MAGIC.startswith(magic):
+            raise PipelineError(f"{self.path}: not a journal of this version; delete its folder to start again")
+        if magic != _MAGIC:
+            return 0
+        end = self._file.tell()
+        while (payload := self._read_record(size)) is not None:
+            head = json.loads(payload.partition(b"\n")[0])
+            if self._description is None:
+                self._description = head
+            else:
+                self._count(end, head)
+            end = self._file.tell()
+        return end
+
+    def _read_record(self, size: int) -> bytes | None:
+        """The record at the position in a file of ``size`` bytes; None where it is torn or damaged."""
+        start = self._file.read(_HEAD.size) or b""
+        if len(start) < _HEAD.size:
+            return None
+        length, checksum = _HEAD.unpack(start)
+        if self._file.tell() + length > size:
+            return None
+        payload: bytes = self._file.read(length)
+        return payload if zlib.crc32(payload) == checksum else None
+
+    def _append(self, record: bytes) -> None:
+        """Write at the end of the file, without a buffer; what did not fit is taken back."""
+        with _disk_errors(self.path):
+            try:
+                rest = memoryview(record)
+                while rest:
+                    rest = rest[self._file.write(rest) :]
+            except OSError:
+                self._file.truncate(self._end)
+                raise
+        self._end += len(record)
+
+    def _count(self, offset: int, head: dict[str, Any]) -> None:
+        self._offsets[head["name1"], head["name2"]] = offset
+        pairs, given, kept = self.statistics.get(head["status"], (0, 0, 0))
+        kept += head["arrays"]["kept"][0]
+        self.statistics[head["status"]] = (pairs + 1, given + head["num_matches"], kept)
+        if head["message"]:
+            self.failures = sorted({*self.failures, head["message"]})[:_MAX_FAILURES]
 
 
-def _matrix(blob: bytes | None, shape: tuple[int, ...]) -> NDArray[np.float64] | None:
-    return None if blob is None else np.frombuffer(blob, "<f8").reshape(shape)
+def _record(head: dict[str, Any], arrays: bytes = b"") -> bytes:
+    payload = json.dumps(head).encode() + b"\n" + arrays
+    return _HEAD.pack(len(payload), zlib.crc32(payload)) + payload
+
+
+def _row(payload: bytes) -> PairRow:
+    line, _, rest = payload.partition(b"\n")
+    head, arrays, start = json.loads(line), dict[str, Any](), 0
+    for name, shape in head.pop("arrays").items():
+        count = int(np.prod(shape))
+        arrays[name] = np.frombuffer(rest, _ARRAYS[name], count, start).reshape(shape)
+        start += arrays[name].nbytes
+    return PairRow(**head, **arrays)
+
+
+def _lock(file: IO[bytes], path: Path) -> None:
+    """Keep other processes off an open file, until it is closed or its process ends, however it ends."""
+    try:
+        try:
+            import fcntl
+        except ImportError:  # Windows
+            import msvcrt
+
+            file.seek(2**30)  # a byte that nobody writes: locked bytes cannot be read there
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
+        else:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError) as error:
+        raise PipelineError(f"{path}: locked by another process") from error
 
 
 def file_stamp(path: Path) -> list[int]:
@@ -126,24 +192,21 @@ def file_stamp(path: Path) -> list[int]:
     return [status.st_size, status.st_mtime_ns]
 
 
-def _difference(found: str, wanted: str) -> str:
-    before, now = json.loads(found), json.loads(wanted)
+def _difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     keys = [key for key in {**before, **now} if before.get(key) != now.get(key)]
     return ", ".join(f"{key} {before.get(key)!r} instead of {now.get(key)!r}" for key in keys)
 
 
 @contextmanager
-def sqlite_errors(path: Path) -> Iterator[None]:
-    """SQLite's exceptions as one line that names the file: locked, full, or broken."""
+def _disk_errors(path: Path) -> Iterator[None]:
+    """The system's exceptions as one line that names the file."""
     try:
         yield
-    except sqlite3.Error as error:
-        words = str(error)
-        if "locked" in words or "busy" in words:
-            words = "locked by another process"
-        elif "full" in words or "disk I/O" in words:
-            words = "cannot be written, the disk is full; what is finished is kept, run the command again to go on"
-        raise PipelineError(f"{path}: {words}") from error
+    except OSError as error:
+        words = error.strerror or str(error)
+        raise PipelineError(
+            f"{path}: cannot be written ({words}); what is finished is kept, run the command again to go on"
+        ) from error
 
 
 @contextmanager

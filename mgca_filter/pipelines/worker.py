@@ -1,8 +1,14 @@
-"""One pair of images through the public door: features and matches in, one row out."""
+"""One pair of images through the filter: features and matches in, one row out; and the processes that do it."""
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import threading
+import time
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import cv2
@@ -38,6 +44,13 @@ class ImageFeatures:
     descriptors: NDArray[Any] | None = None
     K: NDArray[np.float64] | None = None
     image_size: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Unusable:
+    """In the place of what cannot be read: why; the words name the image or the pair."""
+
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -84,21 +97,21 @@ class PairWorker:
         self,
         name1: str,
         name2: str,
-        image1: ImageFeatures | None,
-        image2: ImageFeatures | None,
-        matches: NDArray[Any] | None,
+        image1: ImageFeatures | Unusable,
+        image2: ImageFeatures | Unusable,
+        matches: NDArray[Any] | Unusable | None,
     ) -> PairRow:
         """Filter the matches (M, 2) of a pair, or nearest neighbours of the descriptors where there are none.
 
-        An image that is None, or matches that point nowhere, give a row ``"failed"``.
+        What cannot be used, or matches that point nowhere, give a row ``"failed"``, whose message names what it is.
         """
-        if image1 is None or image2 is None:
-            missing = name1 if image1 is None else name2
-            return _failed(name1, name2, f"{missing}: no features, the image cannot be read")
+        if isinstance(image1, Unusable) or isinstance(image2, Unusable) or isinstance(matches, Unusable):
+            reasons = [part.reason for part in (image1, image2, matches) if isinstance(part, Unusable)]
+            return _failed(name1, name2, reasons[0])
         try:
             result, pairs = self._run(image1, image2, matches)
         except ValueError as error:
-            return _failed(name1, name2, " ".join(str(error).split()))
+            return _failed(name1, name2, f"{name1} with {name2}: {' '.join(str(error).split())}")
         explained = result.status.value in EXPLAINED
         mask = result.mask & explained
         return PairRow(
@@ -145,6 +158,51 @@ class PairWorker:
         values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float32).reshape(-1, 4)
         height, width = image.shape[:2]
         return name, ImageFeatures(values[:, :2], values[:, 2], values[:, 3], descriptors, None, (width, height))
+
+
+def call_worker(filter_options: str, method: str, task: tuple[Any, ...]) -> Any:
+    """A method of this process's own :class:`PairWorker`, which is made at the first call.
+
+    Args:
+        filter_options: of :class:`mgca_filter.MatchFilter`, as JSON.
+    """
+    return getattr(_worker(filter_options), method)(*task)
+
+
+def end_worker() -> None:
+    """Let this process's worker go, so that the next call opens the model again."""
+    _worker.cache_clear()
+
+
+def call_worker_process(filter_options: str, method: str, task: tuple[Any, ...], parent: int) -> Any:
+    """:func:`call_worker` in a process that serves the process ``parent``: one thread, and no life after it."""
+    _serve(parent)
+    return call_worker(filter_options, method, task)
+
+
+@lru_cache(maxsize=1)
+def _worker(filter_options: str) -> PairWorker:
+    return PairWorker(json.loads(filter_options))
+
+
+@lru_cache(maxsize=1)
+def _serve(parent: int) -> None:
+    use_one_thread()
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the parent has the say
+    threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()
+
+
+def _exit_with_parent(parent: int) -> None:
+    """A killed parent cannot stop its workers: they look whether it is still there."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+def use_one_thread() -> None:
+    """One thread for ONNX Runtime: with small graphs as fast as many, and the same bits on every engine."""
+    os.environ.setdefault("MGCA_FILTER_NUM_THREADS", "1")
 
 
 def _failed(name1: str, name2: str, message: str) -> PairRow:

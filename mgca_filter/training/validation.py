@@ -17,7 +17,7 @@ from ..evaluation.metrics import (
     mean_average_precision,
     precision_recall_f,
 )
-from ..evaluation.product import pose_without_ransac
+from ..evaluation.our_rows import pose_without_ransac
 from ..geometry.epipolar import pose_error_deg, symmetric_epipolar_distance_squared
 from ..inference.network_backend import NetworkBackend
 from ..inputs.attributes import MatchAttributes

@@ -8,14 +8,14 @@ from contextlib import closing
 import multi_view
 import numpy as np
 import pytest
-from pipeline_command import assert_one_line
+from pipeline_command import assert_one_line, start_command
 
 from mgca_filter import cli
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 
 pycolmap = pytest.importorskip("pycolmap")
 from mgca_filter.pipelines import colmap  # noqa: E402
-from mgca_filter.pipelines.colmap_compare import compare  # noqa: E402
+from mgca_filter.pipelines.mapper_comparison import compare  # noqa: E402
 from mgca_filter.pipelines.worker import PairRow  # noqa: E402
 
 CONFIGURATION = pycolmap.TwoViewGeometryConfiguration
@@ -32,6 +32,12 @@ MODELS = {
 @pytest.fixture
 def database(tmp_path, views, raw_matches):
     return multi_view.write_database(tmp_path / "raw.db", views, raw_matches)
+
+
+@pytest.fixture
+def few_pairs(tmp_path, views, raw_matches):
+    """A database of all views and two pairs."""
+    return multi_view.write_database(tmp_path / "raw.db", views, {pair: raw_matches[pair] for pair in ((0, 1), (1, 2))})
 
 
 def read_geometries(path) -> dict[tuple[int, int], object]:
@@ -68,7 +74,8 @@ def test_geometry_of_every_pair_is_true(database, views, tmp_path, capsys):
         assert (512.0 * sampson_distance(normalized, geometry.E) < 1.01).all()
 
 
-def test_everything_else_is_copied(database, tmp_path):
+def test_everything_else_is_copied(few_pairs, tmp_path):
+    database = few_pairs
     assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
     tables = ("cameras", "images", "keypoints", "descriptors", "matches")
     with closing(sqlite3.connect(database)) as before, closing(sqlite3.connect(tmp_path / "out.db")) as after:
@@ -77,7 +84,8 @@ def test_everything_else_is_copied(database, tmp_path):
             assert before.execute(query).fetchall() == after.execute(query).fetchall()
 
 
-def test_in_place_equals_a_copy(database, tmp_path):
+def test_in_place_equals_a_copy(few_pairs, tmp_path):
+    database = few_pairs
     assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
     assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0
     copied, in_place = read_geometries(tmp_path / "out.db"), read_geometries(database)
@@ -90,11 +98,11 @@ def test_in_place_equals_a_copy(database, tmp_path):
 def test_threshold_and_descriptors_count(database, tmp_path):
     """Options that change the answer when they are obeyed."""
     kept = {}
-    for name, words in {"default": [], "tight": ["--threshold", "0.2"], "bare": ["--no-descriptors"]}.items():
+    for name, words in {"default": [], "tight": ["--threshold", "0.2"], "points": ["--no-descriptors"]}.items():
         assert cli.main(["colmap", str(database), "-o", str(tmp_path / f"{name}.db"), "-q", *words]) == 0
         kept[name] = [len(g.inlier_matches) for g in read_geometries(tmp_path / f"{name}.db").values()]
     assert sum(kept["tight"]) < 0.6 * sum(kept["default"])
-    assert kept["bare"] != kept["default"]
+    assert kept["points"] != kept["default"]
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -195,6 +203,77 @@ def test_database_locked_by_another_process(database, tmp_path, capsys):
     assert read_geometries(database) == {}
     assert cli.main(["colmap", str(database), "--in-place", "-q"]) == 0  # from the journal of the first try
     assert len(read_geometries(database)) == 6
+
+
+def change(database, *statements: str) -> None:
+    with closing(sqlite3.connect(database)) as plain:
+        for statement in statements:
+            plain.execute(statement)
+        plain.commit()
+
+
+UNUSABLE = {
+    "no camera": (["INSERT INTO cameras SELECT 2, model, width, height, params, prior_focal_length FROM cameras",
+                   "UPDATE images SET camera_id = 2 WHERE image_id = 2", "PRAGMA foreign_keys = OFF",
+                   "DELETE FROM cameras WHERE camera_id = 2"], ["view01.png: its camera 2 is not in the database"]),
+    "focal length 0": (["INSERT INTO cameras SELECT 2, model, width, height, zeroblob(32), 1 FROM cameras",
+                        "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: its camera 2", "0, 0"]),
+    "short parameters": (["INSERT INTO cameras SELECT 2, model, width, height, zeroblob(16), 1 FROM cameras",
+                          "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: "]),
+    "unknown model": (["INSERT INTO cameras SELECT 2, 99, width, height, params, 1 FROM cameras",
+                       "UPDATE images SET camera_id = 2 WHERE image_id = 2"], ["view01.png: "]),
+    "short keypoints": (["UPDATE keypoints SET data = zeroblob(10) WHERE image_id = 2"], ["view01.png: "]),
+    "short descriptors": (["UPDATE descriptors SET data = zeroblob(10) WHERE image_id = 2"], ["view01.png: "]),
+    "short matches": (["UPDATE matches SET data = zeroblob(3)"], [" with "]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", UNUSABLE)
+def test_a_damaged_row_costs_its_own_pairs_only(database, tmp_path, capsys, defect):
+    statements, words = UNUSABLE[defect]
+    change(database, *statements)
+    status = cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"])
+    captured = capsys.readouterr()
+    lines = captured.err.splitlines()
+    assert captured.out == ""
+    assert all(word in lines[0] for word in words), lines
+    assert "Traceback" not in captured.err
+    healthy = 0 if defect == "short matches" else 3
+    assert status == (0 if healthy else 1)
+    assert lines[-1] == f"mgca-match: {6 - healthy} pairs failed"
+    assert len(read_geometries(tmp_path / "out.db")) == healthy
+
+
+def test_a_name_that_is_not_utf8_is_a_name(database, tmp_path):
+    change(database, "UPDATE images SET name = CAST(x'66DF2E706E67' AS TEXT) WHERE image_id = 2")
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
+    assert len(read_geometries(tmp_path / "out.db")) == 6
+
+
+@pytest.mark.parametrize(
+    ("statement", "words"),
+    [
+        ("DROP TABLE descriptors", ["raw.db", "not a COLMAP database", "descriptors"]),
+        ("ALTER TABLE cameras RENAME COLUMN params TO p", ["raw.db"]),
+        ("ALTER TABLE images RENAME COLUMN camera_id TO camera", ["raw.db"]),
+        ("ALTER TABLE matches DROP COLUMN rows", ["raw.db"]),
+        ("DROP TABLE two_view_geometries", []),
+    ],
+)
+def test_a_database_of_another_make_is_one_line(database, tmp_path, statement, words):
+    """In a process of its own: COLMAP's library must not take it down either."""
+    change(database, "PRAGMA foreign_keys = OFF", "DROP INDEX IF EXISTS index_name", statement)
+    process = start_command("colmap", database, "-o", tmp_path / "out.db", "-q")
+    out, err = process.communicate(timeout=120)
+    assert (process.returncode, err.count("\n")) == ((2, 1) if words else (0, 0)), err
+    for word in words:
+        assert word in err
+
+
+def test_a_truncated_database_is_one_line(database, tmp_path, capsys):
+    database.write_bytes(database.read_bytes()[:-20_000])
+    assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 2
+    assert_one_line(capsys.readouterr(), "raw.db")
 
 
 def test_misuse_is_one_line(database, tmp_path, capsys):

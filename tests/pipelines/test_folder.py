@@ -18,8 +18,7 @@ from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.geometry.epipolar import pose_error_deg
-from mgca_filter.pipelines.folder import FolderJob
-from mgca_filter.pipelines.folder_pairs import exhaustive_pairs, sequential_pairs
+from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
 
@@ -44,7 +43,7 @@ def expected(tmp_path_factory, views):
 
 
 def test_rows_equal_match_images(image_folder, views, expected):
-    """The pipeline is the public door, pair by pair."""
+    """The pipeline is ``match_images``, pair by pair."""
     rows = [json.loads(line) for line in expected.splitlines()]
     assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
     for row in rows:
@@ -189,10 +188,10 @@ def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
     from mgca_filter.pipelines.journal import Journal
 
     (tmp_path / "out.jsonl.work").mkdir()
-    journal = Journal(tmp_path / "out.jsonl.work" / "journal.db")
+    journal = Journal(tmp_path / "out.jsonl.work" / "journal.log")
     journal.begin({"threshold": 2.0})
     assert run(image_folder, tmp_path / "out.jsonl") == 2
-    assert_one_line(capsys.readouterr(), "journal.db", "locked by another process")
+    assert_one_line(capsys.readouterr(), "journal.log", "locked by another process")
     journal.close()
     assert run(image_folder, tmp_path / "out.jsonl") == 2
     assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 2.0 instead of 1.0")
@@ -216,12 +215,35 @@ def test_resume_with_another_model_of_the_same_name_is_refused(image_folder, tmp
     assert "(3 were done before)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("output", "package", "extra"), [("o.h5", "h5py", "hloc"), ("o.db", "pycolmap", "colmap")])
-def test_a_missing_package_is_told_before_the_work(image_folder, tmp_path, monkeypatch, capsys, output, package, extra):
+@pytest.mark.parametrize(
+    ("command", "package", "extra"),
+    [
+        (["folder", "images", "-o", "o.h5"], "h5py", "hloc"),
+        (["folder", "images", "-o", "o.db"], "pycolmap", "colmap"),
+        (["folder", "images", "-o", "o.jsonl"], "tqdm", "folder"),
+        (["folder", "images", "-o", "o.jsonl", "-j", "2"], "joblib", "folder"),
+        (["folder", "images", "-o", "o.jsonl", "--engine", "ray"], "ray", "ray"),
+        (["hloc", "f.h5", "m.h5", "-o", "o.h5"], "h5py", "hloc"),
+        (["hloc", "f.h5", "m.h5", "-o", "o.h5"], "tqdm", "hloc"),
+        (["colmap", "i.db", "-o", "o.db"], "pycolmap", "colmap"),
+        (["colmap", "i.db", "-o", "o.db"], "joblib", "colmap"),
+        (["colmap", "i.db", "--in-place"], "tqdm", "colmap"),
+    ],
+)
+def test_a_missing_package_is_told_before_the_work(
+    image_folder, tmp_path, monkeypatch, capsys, command, package, extra
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("f.h5", "m.h5", "i.db"):
+        (tmp_path / name).touch()
+    for module in [name for name in sys.modules if name.startswith("mgca_filter.pipelines.")]:
+        if module.endswith((".colmap", ".hloc")):
+            monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, package, None)
-    assert run(image_folder, tmp_path / output) == 2
+    before = sorted(tmp_path.rglob("*"))
+    assert cli.main(command) == 2
     assert_one_line(capsys.readouterr(), package, f"mgca_filter[{extra}]")
-    assert not list(tmp_path.glob("*.work"))
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path, expected):
@@ -235,7 +257,7 @@ def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path,
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
 
     cache = ["--cache", tmp_path / "cache"]
-    assert run(image_folder, tmp_path / "first.jsonl", *cache) == 0
+    assert run(image_folder, tmp_path / "first.jsonl", *cache, "--pairs", "sequential", "--overlap", 1) == 0
     process = start_command("folder", image_folder, "-o", output, *OPTIONS, *cache, preexec_fn=little_disk)
     out, err = process.communicate()
     assert process.returncode == 2
@@ -272,3 +294,26 @@ def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
     (tmp_path / "model").mkdir()
     models = pycolmap.incremental_mapping(tmp_path / "out.db", image_folder, tmp_path / "model", options)
     assert max(model.num_reg_images() for model in models.values()) == 4
+
+
+def test_intrinsics_of_another_size_are_told(image_folder, tmp_path, capsys):
+    """The rows are those of the matches; what is odd about the camera is a line, unless the user wants quiet."""
+    (image_folder / "view03.png").write_bytes(b"")
+    image = cv2.imread(str(image_folder / "view00.png"))
+    cv2.imwrite(str(image_folder / "view00.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
+    few = [str(image_folder), "--K", K_WORDS, "--max-keypoints", "300"]
+    cli.main(["folder", *few, "-o", str(tmp_path / "a.jsonl")])
+    assert "mgca-match: one K for images of 2 sizes (480 x 640, 640 x 480)" in capsys.readouterr().err
+    cli.main(["folder", *few, "-q", "-o", str(tmp_path / "b.jsonl")])
+    assert "one K" not in capsys.readouterr().err
+    cli.main(["folder", str(image_folder), "--max-keypoints", "300", "-o", str(tmp_path / "c.jsonl")])
+    assert "one K" not in capsys.readouterr().err
+
+
+def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path, expected):
+    few = ["--pairs", "sequential", "--overlap", 1]
+    assert run(image_folder, tmp_path / "sure.jsonl", *few, "--keep-precision", 0.5) == 0
+    first, sure = json.loads(expected.splitlines()[0]), read_rows(tmp_path / "sure.jsonl")[0]
+    assert 0 < sure["num_inliers"] != first["num_inliers"]
+    assert run(image_folder, tmp_path / "cpu.jsonl", *few, "--providers", "CPUExecutionProvider") == 0
+    assert read_rows(tmp_path / "cpu.jsonl")[0] == first

@@ -78,8 +78,8 @@ def walk(file):
 
 
 def test_the_filter_sees_the_files_as_they_are(tmp_path, views, raw_matches):
-    """Bare points and the image's size: the same rows as the public door."""
-    features, matches = write_files(tmp_path, views, raw_matches, sift=False)
+    """Points and the image's size: the same rows as ``MatchFilter``."""
+    features, matches = write_files(tmp_path, views, {(0, 1): raw_matches[0, 1]}, sift=False)
     assert run(features, matches, tmp_path / "filtered.h5", "-q", "--threshold", "2") == 0
     size = views[0].image.shape[1::-1]
     with h5py.File(tmp_path / "filtered.h5") as file:
@@ -91,7 +91,7 @@ def test_the_filter_sees_the_files_as_they_are(tmp_path, views, raw_matches):
 
 
 def test_descriptors_are_used_unless_forbidden(tmp_path, views, raw_matches):
-    features, matches = write_files(tmp_path, views, raw_matches)
+    features, matches = write_files(tmp_path, views, {(0, 1): raw_matches[0, 1]})
     assert run(features, matches, tmp_path / "with.h5", "-q") == 0
     assert run(features, matches, tmp_path / "without.h5", "-q", "--no-descriptors") == 0
     first, second = contents(tmp_path / "with.h5"), contents(tmp_path / "without.h5")
@@ -122,3 +122,29 @@ def test_file_that_another_process_writes(tmp_path, views, raw_matches, capsys):
         assert run(features, matches, tmp_path / "o.h5", "-q") == 2
         other.stdin.close()
     assert_one_line(capsys.readouterr(), "matches.h5", "locked by another process")
+
+
+@pytest.mark.parametrize("defect", ["shape", "index", "checksum"])
+def test_a_damaged_dataset_costs_its_own_pairs_only(tmp_path, views, raw_matches, capsys, defect):
+    features, matches = write_files(tmp_path, views[:3], {pair: raw_matches[pair] for pair in ((0, 1), (1, 2))})
+    with h5py.File(features, "r+") as file:
+        points = file[NAMES[2]]["keypoints"][()]
+        if defect != "index":
+            del file[NAMES[2]]["keypoints"]
+        if defect == "shape":
+            file[NAMES[2]]["keypoints"] = points.ravel()
+        elif defect == "checksum":
+            file[NAMES[2]].create_dataset("keypoints", data=points, fletcher32=True)
+            start = file[NAMES[2]]["keypoints"].id.get_chunk_info(0).byte_offset
+    if defect == "checksum":
+        data = bytearray(features.read_bytes())
+        data[start] ^= 1
+        features.write_bytes(data)
+    if defect == "index":
+        with h5py.File(matches, "r+") as file:
+            group = file[NAMES[1].replace("/", "-")][NAMES[2].replace("/", "-")]
+            group["matches0"][...] = 99999
+    assert run(features, matches, tmp_path / "out.h5", "-q") == 0
+    assert_one_line(capsys.readouterr(), NAMES[2])
+    kept = {name: (values > -1).any() for name, values in contents(tmp_path / "out.h5").items() if "matches0" in name}
+    assert sorted(kept.values()) == [False, True]

@@ -9,10 +9,11 @@ import pytest
 from pipeline_command import K_WORDS
 
 from mgca_filter import cli
+from mgca_filter.pipelines.journal import PipelineError
+from mgca_filter.pipelines.run import Workers
 from mgca_filter.pipelines.worker import ImageFeatures, PairWorker
 
 ray = pytest.importorskip("ray")
-from mgca_filter.pipelines.ray_engine import RayEngine  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
 
@@ -21,7 +22,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
 def paths(monkeypatch):
     """Ray's workers import the package from here, whether it is installed or not."""
     root = os.path.dirname(os.path.dirname(os.path.dirname(__file__)))
-    monkeypatch.setenv("PYTHONPATH", root)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([root, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
     monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 starves on a busy machine
 
@@ -41,14 +42,46 @@ def test_killed_worker_is_replaced_and_its_pairs_repeated(paths, views):
     images: dict[str, ImageFeatures] = dict(alone.extract(name, data, "sift", 1000) for name, data in files.items())
     pairs = [(a, b) for a in images for b in images if a < b]
     expected = {(a, b): alone.filter(a, b, images[a], images[b], None).kept.tolist() for a, b in pairs}
-    engine = RayEngine({}, 2)
-    try:
-        shared = {name: engine.share(image) for name, image in images.items()}
+    with Workers({}, 2, "ray") as workers:
+        shared = {name: workers.share(image) for name, image in images.items()}
         rows = {}
-        for row in engine.map("filter", ((a, b, shared[a], shared[b], None) for a, b in pairs)):
+        for row in workers.map("filter", ((a, b, shared[a], shared[b], None) for a, b in pairs)):
             if not rows:
-                ray.kill(engine._actors[0], no_restart=False)
+                ray.kill(actors(workers)[0], no_restart=False)
             rows[row.name1, row.name2] = row.kept.tolist()
-    finally:
-        engine.close()
     assert rows == expected
+
+
+def actors(workers: Workers) -> list:
+    """The actors of the pool that Ray's backend for joblib keeps."""
+    return [actor for actor, _ in workers._parallel._backend._pool._actor_pool]
+
+
+def test_workers_that_stay_dead_are_a_pipeline_error(paths):
+    def kill_again_and_again() -> None:
+        with Workers({}, 2, "ray") as workers:
+            for _ in workers.map("extract", ((f"{k}.png", b"", "sift", 10) for k in range(100))):
+                for actor in actors(workers):
+                    ray.kill(actor, no_restart=True)
+
+    with pytest.raises(PipelineError, match="a Ray worker died more than 3 times"):
+        kill_again_and_again()
+    assert not ray.is_initialized()
+
+
+def test_an_error_of_the_source_comes_through(paths):
+    def tasks():
+        yield from ((f"{k}.png", b"", "sift", 10) for k in range(5))
+        raise PipelineError("the source broke")
+
+    with pytest.raises(PipelineError, match="the source broke"), Workers({}, 2, "ray") as workers:
+        list(workers.map("extract", tasks()))
+    assert not ray.is_initialized()
+
+
+def test_no_cluster_at_the_address_is_one_line(paths, image_folder, tmp_path, capfd):
+    words = ["folder", str(image_folder), "-o", str(tmp_path / "o.jsonl"), "--engine", "ray", "-j", "2"]
+    assert cli.main([*words, "--address", "auto"]) == 2
+    error = capfd.readouterr().err
+    assert error.startswith("mgca-match: Ray at auto: ")
+    assert error.count("\n") == 1

@@ -1,4 +1,4 @@
-"""COLMAP's mapper on its own geometric verification of the matches, and on ours: what comes out of each."""
+"""COLMAP's mapper on its own geometric verification of the matches, and on the filter's: what comes out of each."""
 
 from __future__ import annotations
 

@@ -1,0 +1,118 @@
+"""One command, one usage: which words lead where, options written out, what every command does first."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from pipeline_command import ROOT, assert_one_line, start_command
+
+from mgca_filter import cli
+
+IMAGES = ROOT / "examples" / "images"
+LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
+COMMANDS = ("colmap", "hloc", "folder", "run")
+
+
+def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        cli.main([*words, "--help"])
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_the_usage_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+    usage = help_of(capsys).partition("\n\n")[0]
+    for command in COMMANDS:
+        assert f"mgca-match {command} " in usage
+        help_of(capsys, command)
+
+
+def test_help_says_whether_photos_are_turned(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, expected in (([], "turned first"), (["folder"], "does\nnot turn photos as their EXIF says")):
+        text = help_of(capsys, *words)
+        assert expected in text
+        assert "--K is for the" in text
+
+
+def test_run_is_a_word_of_the_command_as_well(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text("import sys; print(sys.argv[1:])")
+    process = start_command("run", "script.py", "--flag", cwd=tmp_path)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (0, "['--flag']\n"), err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [LEFT, RIGHT, "--k", "820,820,511.5,383.5"],
+        [LEFT, RIGHT, "--keep", "0.9"],
+        [LEFT, RIGHT, "--thresh", "2"],
+        ["colmap", "a.db", "-o", "b.db", "--no-desc"],
+        ["hloc", "f.h5", "m.h5", "--out", "o.h5"],
+        ["folder", "images", "-o", "o.jsonl", "--k", "1,1,1,1"],
+    ],
+)
+def test_options_are_written_out(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    assert cli.main(words) == 2
+    assert_one_line(capsys.readouterr(), "--")
+
+
+def test_the_runtime_does_not_report_home_unless_the_user_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for before, after in ((None, "1"), ("0", "0")):
+        monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+        if before is not None:
+            monkeypatch.setenv("ORT_DISABLE_TELEMETRY", before)
+        assert cli.main(["no.png", "such.png", "-q"]) == 2
+        assert os.environ["ORT_DISABLE_TELEMETRY"] == after
+
+
+def test_quiet_says_nothing_without_a_home(tmp_path: Path) -> None:
+    """As in a container: no folder for what the runtime wants to keep."""
+    (tmp_path / "file").touch()
+    environment = {"PATH": os.environ["PATH"], "HOME": str(tmp_path / "file" / "home"), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-m", "mgca_filter", LEFT, RIGHT, "--max-keypoints", "300", "-q"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+K_WORDS = ["--K", "820,820,511.5,383.5"]
+
+
+@pytest.mark.parametrize(
+    ("scale", "turned", "expected"),
+    [(1.0, False, None), (0.9, False, "one K for images of 2 sizes"), (1.0, True, "one K for images of 2 sizes"),
+     (0.4, False, "the principal point 511.5,383.5 is far from the middle of an image of 410 x 307")],
+)  # fmt: skip
+def test_one_k_for_images_of_two_sizes_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scale: float, turned: bool, expected: str | None
+) -> None:
+    image = cv2.resize(cv2.imread(RIGHT), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    path = str(tmp_path / "other.png")
+    cv2.imwrite(path, cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE) if turned else image)
+    words = [LEFT, path, *K_WORDS, "--max-keypoints", "100"]
+    cli.main(words)
+    error = capsys.readouterr().err
+    assert error == "" if expected is None else f"mgca-match: warning: {expected}" in error
+    cli.main([*words, "-q"])
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(4, 0), (5, 7000), (1, 7424), (1, 0)])
+def test_sixteen_bit_files_keep_their_matches(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], gain: int, offset: int
+) -> None:
+    """10 bits, thermal cameras, 8 bits in 16: about as many matches as of the picture itself."""
+    paths = []
+    for name, path in (("left", LEFT), ("right", RIGHT)):
+        grey = cv2.imread(path, cv2.IMREAD_GRAYSCALE).astype(np.uint16)
+        paths.append(str(tmp_path / f"{name}.png"))
+        cv2.imwrite(paths[-1], grey * gain + offset)
+    assert cli.main([*paths, *K_WORDS]) == 0
+    kept = int(capsys.readouterr().out.splitlines()[2].split(" matches in, ")[1].split(" kept")[0])
+    assert kept > 190  # of the picture in 8 bits: 211
