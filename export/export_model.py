@@ -19,7 +19,7 @@ from parity import check_parity, format_parity
 import mgca_filter
 from mgca_filter.export.onnx_export import ModelDescription, export_model, halve_weights
 from mgca_filter.inference.calibration import Calibration
-from mgca_filter.inference.checksums import SUMS_NAME, record_checksums
+from mgca_filter.inference.model_file import SUMS_NAME, record_checksums
 from mgca_filter.network import MGCANet, load_network
 from mgca_filter.training.config import load_config
 

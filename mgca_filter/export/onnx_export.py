@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from ..inference.backend import INPUT_NAMES, OUTPUT_NAMES
 from ..inference.calibration import Calibration
-from ..inference.metadata import CONTRACT_VERSION, METADATA_KEYS
+from ..inference.model_file import CONTRACT_VERSION, METADATA_KEYS
 from ..inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from ..network import MGCANet, save_network
 from ..network.config import ATTRIBUTE_CHANNELS
