@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import onnxruntime
 from onnx import TensorProto, helper, numpy_helper
-from parity import two_view_input
 
 import mgca_filter
+from mgca_filter.export.parity import two_view_input
 from mgca_filter.inference.backend import OUTPUT_NAMES
 
 # Parts by the names of their nodes, first match first; what ONNX Runtime fused carries its own name.

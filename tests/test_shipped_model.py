@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_tools import parity
 
 import mgca_filter
+from mgca_filter.export import parity
 from mgca_filter.inference import Backend, open_backend
 from mgca_filter.network import PRESETS, NetworkConfig
 

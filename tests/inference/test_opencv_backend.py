@@ -12,11 +12,11 @@ import numpy as np
 import onnx
 import pytest
 from conftest import METADATA, Scene, build_model
-from export_tools import parity
 from test_backends import BackendContract, ignores_threads, needs_fork, random_input, status_of_child
 
 import mgca_filter
 from mgca_filter import BackendError, ModelError, filter_matches
+from mgca_filter.export import parity
 from mgca_filter.inference import Backend, OpenCvBackend, open_backend, shared_backend
 
 opencv5 = pytest.mark.skipif(int(cv2.__version__.split(".")[0]) < 5, reason="the backend needs OpenCV 5")
