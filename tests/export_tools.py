@@ -20,6 +20,3 @@ def load_export_module(name: str) -> ModuleType:
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
-
-
-parity = load_export_module("parity")

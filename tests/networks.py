@@ -56,3 +56,13 @@ def sign_free_difference(E: Tensor, other: Tensor) -> float:
     """Largest difference of two batches of essential matrices (B, 3, 3), each up to its sign."""
     differences = torch.minimum((E - other).abs().amax((1, 2)), (E + other).abs().amax((1, 2)))
     return float(differences.max())
+
+
+def settled_network(config: NetworkConfig) -> MGCANet:
+    """A random network whose norms know the statistics of its input."""
+    torch.manual_seed(2)
+    network = MGCANet(config).train()
+    with torch.no_grad():
+        for seed in range(8):
+            network(*two_view_batch(64, batch=2, seed=seed))
+    return network.eval().requires_grad_(False)

@@ -14,9 +14,8 @@ from image_files import promising
 
 import mgca_filter
 from mgca_filter import ModelError, model_path
-from mgca_filter.inference import metadata as backend_metadata
-from mgca_filter.inference import open_backend
-from mgca_filter.inference.checksums import SUMS_NAME, check_checksum, read_checksums, record_checksums
+from mgca_filter.inference import model_file, open_backend
+from mgca_filter.inference.model_file import SUMS_NAME, ModelFile, read_checksums, record_checksums
 from mgca_filter.pipelines.worker import PairWorker
 
 PACKAGE = Path(mgca_filter.__file__).parent
@@ -47,7 +46,7 @@ def test_checksums_of_the_shipped_models_are_right() -> None:
     shipped = [p for p in model_path().parent.iterdir() if p.suffix in (".onnx", ".safetensors")]
     assert set(listed) == {path.name for path in shipped}
     for path in shipped:
-        check_checksum(path)
+        assert ModelFile.read(path).sha256 == listed[path.name]
 
 
 @pytest.mark.parametrize("backend", ["onnxruntime", "opencv", "torch"])
@@ -69,7 +68,7 @@ def test_models_that_nobody_listed_are_not_checked(tmp_path: Path) -> None:
 
 def test_a_file_too_large_for_a_model_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = build_model(tmp_path / "m.onnx")
-    monkeypatch.setattr(backend_metadata, "MAX_MODEL_BYTES", path.stat().st_size - 1)
+    monkeypatch.setattr(model_file, "MAX_MODEL_BYTES", path.stat().st_size - 1)
     with pytest.raises(ModelError, match=r"m\.onnx.*bytes"):
         open_backend(path)
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from export_tools import parity
 
 import mgca_filter
-from mgca_filter.inference import Backend, open_backend
+from mgca_filter.export import parity
+from mgca_filter.inference import Backend, shared_backend
 from mgca_filter.network import PRESETS, NetworkConfig
 
 MODELS = Path(mgca_filter.__file__).parent / "models"
@@ -18,7 +18,7 @@ ONNX, TORCH = MODELS / "mgca_small.onnx", MODELS / "mgca_small.safetensors"
 
 @pytest.fixture(scope="module")
 def backends() -> tuple[Backend, Backend]:
-    return open_backend(ONNX, "onnxruntime"), open_backend(TORCH, "torch")
+    return shared_backend(ONNX, "onnxruntime"), shared_backend(TORCH, "torch")
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 127, 2000])

@@ -1,19 +1,26 @@
-"""Logits to probabilities: Platt scaling fitted on real pairs, and how far it can be trusted."""
+"""Logits to probabilities: Platt scaling fitted on real pairs, and how far it can be trusted.
+
+``python -m mgca_filter.export.calibration_fit MODEL.onnx BUNDLES SCENE …`` fits on the even pairs of the scenes named,
+checks on the odd ones, and prints what ``python -m mgca_filter.export --calibration`` takes; ``--calibrate`` there does
+both at once.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from ..data.scene_bundle import ScenePair
+from ..data.scene_bundle import SceneBundle, ScenePair
 from ..evaluation.methods import BoolArray, FloatArray
 from ..evaluation.metrics import TRUE_INLIER_DISTANCE_SQUARED
 from ..geometry.epipolar import symmetric_epipolar_distance_squared
 from ..inference.calibration import Calibration, sigmoid
 from ..match_filter import MatchFilter
 
+PAIRS_PER_SCENE = 24
 _NEWTON_STEPS = 50
 _RIDGE = 1e-9
 
@@ -65,3 +72,34 @@ def expected_calibration_error(probabilities: FloatArray, truth: BoolArray, bins
     count = np.bincount(index, minlength=bins)
     gap = np.bincount(index, probabilities, bins) - np.bincount(index, truth.astype(float), bins)
     return float(np.abs(gap).sum() / max(count.sum(), 1))
+
+
+def calibrate(
+    model: Path, bundles: Path, scenes: Iterable[str], pairs_per_scene: int = PAIRS_PER_SCENE
+) -> tuple[Calibration, float]:
+    """Calibration of a model file on scenes of a folder, and its expected error on as many other pairs of them."""
+    from ..training.validation import select_pairs  # needs PyTorch, which the fit itself does not
+
+    pairs = select_pairs([SceneBundle(bundles / f"{scene}.npz") for scene in scenes], pairs_per_scene)
+    logits, truth = collect_logits(model, pairs[::2])
+    calibration = fit_calibration(np.concatenate(logits), np.concatenate(truth))
+    logits, truth = collect_logits(model, pairs[1::2])
+    probabilities = calibration.probabilities(np.concatenate(logits)).astype(float)
+    return calibration, expected_calibration_error(probabilities, np.concatenate(truth))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print scale, offset and the calibration error on pairs that the fit did not see."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("bundles", type=Path, help="folder of scene bundles")
+    parser.add_argument("scenes", nargs="+")
+    parser.add_argument("--per-scene", type=int, default=PAIRS_PER_SCENE)
+    options = parser.parse_args(arguments)
+    calibration, error = calibrate(options.model, options.bundles, options.scenes, options.per_scene)
+    print(f"{calibration.scale:.4f} {calibration.offset:.4f}")
+    print(f"expected calibration error on other pairs of these scenes: {error:.4f}")
+
+
+if __name__ == "__main__":
+    main()

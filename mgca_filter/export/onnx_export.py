@@ -12,26 +12,23 @@ from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import onnx
 import torch
 from torch import Tensor, nn
 
 from ..inference.backend import INPUT_NAMES, OUTPUT_NAMES
 from ..inference.calibration import Calibration
-from ..inference.metadata import CONTRACT_VERSION, METADATA_KEYS
+from ..inference.model_file import CONTRACT_VERSION, METADATA_KEYS
 from ..inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from ..network import MGCANet, save_network
 from ..network.config import ATTRIBUTE_CHANNELS
 from ..network.graph import AnnularConvolution
 from ..network.mgca_net import Prior
 from ..network.point_cn import ChannelBatchNorm, LinearNorm, PointCN
-from .onnx_simplify import simplify
+from .speed_passes import simplify
 
 OPSET = 17
 MINIMUM_ONNXRUNTIME = "1.15"
-_SMALLEST_HALVED = 1024
-_HALF_MAXIMUM = 6e4
 NORMALIZATION = (
     "correspondences = (x1, y1, x2, y2) = K^-1 (u, v, 1), undistorted pixels, centre of the top-left pixel (0, 0); "
     "attributes = ratio, best of list, log2(size2 / size1), cos and sin of angle2 - angle1, "
@@ -176,26 +173,6 @@ def export_onnx(network: MGCANet, path: str | Path, metadata: Mapping[str, str])
     onnx.helper.set_model_props(model, dict(metadata))
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(path))
-
-
-def halve_weights(source: str | Path, target: str | Path) -> None:
-    """Write a twin of an ONNX file that stores its large weights in half precision and computes in full precision.
-
-    The casts back are done once, when a runtime opens the file.
-    """
-    model = onnx.load(str(source))
-    casts = []
-    for tensor in model.graph.initializer:
-        values = onnx.numpy_helper.to_array(tensor)
-        if values.dtype == np.float32 and values.size >= _SMALLEST_HALVED and np.abs(values).max() < _HALF_MAXIMUM:
-            name, half = tensor.name, f"{tensor.name}_half"
-            tensor.CopyFrom(onnx.numpy_helper.from_array(values.astype(np.float16), half))
-            casts.append(onnx.helper.make_node("Cast", [half], [name], half, to=onnx.TensorProto.FLOAT))
-    nodes = [*casts, *model.graph.node]
-    del model.graph.node[:]
-    model.graph.node.extend(nodes)
-    onnx.checker.check_model(model, full_check=True)
-    onnx.save(model, str(target))
 
 
 def export_model(network: MGCANet, folder: str | Path, description: ModelDescription) -> tuple[Path, Path]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import threading
 import warnings
 from pathlib import Path
 
@@ -11,8 +9,8 @@ import numpy as np
 
 from ..errors import BackendError, MgcaFilterError
 from ..types import Providers
-from .backend import Backend
-from .metadata import CONTRACT_VERSION, METADATA_KEYS, ModelMetadata
+from .backend import Backend, ProcessLock
+from .model_file import CONTRACT_VERSION, METADATA_KEYS, ModelMetadata
 from .onnxruntime_ import OnnxBackend
 from .opencv_ import OpenCvBackend
 from .torch_ import TorchBackend
@@ -22,7 +20,7 @@ _PROBE_MATCHES = 16
 
 # By path, backend and providers: time and size of the file, and what was opened from it.
 _open_backends: dict[tuple[Path, str, str], tuple[tuple[int, int] | None, Backend]] = {}
-_open_lock = threading.Lock()
+_open_lock = ProcessLock()
 
 __all__ = [
     "BACKENDS",
@@ -88,13 +86,3 @@ def shared_backend(path: Path, backend: str = "auto", providers: Providers | Non
         if known is None or known[0] != stamp:
             known = _open_backends[key] = (stamp, open_backend(path, backend, providers))
         return known[1]
-
-
-def _renew_lock() -> None:
-    global _open_lock
-    _open_lock = threading.Lock()
-
-
-if hasattr(os, "register_at_fork"):
-    # A child forked while another thread opens a model would wait for ever for a thread that it does not have.
-    os.register_at_fork(after_in_child=_renew_lock)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+import os
+import threading
 from typing import Protocol
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import BackendError, ModelError
 from ..inputs.attributes import ATTRIBUTE_COUNT
-from .metadata import ModelMetadata
+from .model_file import ModelFile, ModelMetadata
 
 Float32Array = NDArray[np.float32]
 
@@ -46,6 +46,19 @@ class Backend(Protocol):
         """
 
 
+class ProcessLock:
+    """A lock that a fork cannot leave locked: each process takes its own, and a forked child's is free."""
+
+    def __init__(self) -> None:
+        self._locks: dict[int, threading.Lock] = {}
+
+    def __enter__(self) -> None:
+        self._locks.setdefault(os.getpid(), threading.Lock()).acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._locks[os.getpid()].release()
+
+
 def check_input(correspondences: Float32Array, attributes: Float32Array) -> None:
     """Raise BackendError unless the arrays are what :meth:`Backend.infer` takes."""
     for name, array, width in (("correspondences", correspondences, 4), ("attributes", attributes, ATTRIBUTE_COUNT)):
@@ -59,9 +72,9 @@ def check_input(correspondences: Float32Array, attributes: Float32Array) -> None
         raise BackendError(f"expected at least one match, got correspondences of shape {correspondences.shape}")
 
 
-def check_names(path: Path, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-    """Raise ModelError unless a model file has the contract's inputs and outputs."""
-    if sorted(inputs) != sorted(INPUT_NAMES):
-        raise ModelError(f"{path}: inputs {list(inputs)}, expected {INPUT_NAMES}")
-    if not set(OUTPUT_NAMES) <= set(outputs):
-        raise ModelError(f"{path}: outputs {list(outputs)}, expected {OUTPUT_NAMES}")
+def check_names(file: ModelFile) -> None:
+    """Raise ModelError unless an ONNX file has the contract's inputs and outputs."""
+    if sorted(file.inputs) != sorted(INPUT_NAMES):
+        raise ModelError(f"{file.path}: inputs {file.inputs}, expected {INPUT_NAMES}")
+    if not set(OUTPUT_NAMES) <= set(file.outputs):
+        raise ModelError(f"{file.path}: outputs {file.outputs}, expected {OUTPUT_NAMES}")

@@ -1,4 +1,7 @@
-"""From logits to probabilities, and the prior that scores what never entered the network."""
+"""From logits to probabilities, and the prior that scores what never entered the network.
+
+Scores near zero underflow, which is as right as it can be, also where the caller has ``np.seterr(all="raise")``.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,9 @@ _ERF_COEFFICIENTS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254
 def sigmoid(logits: ArrayLike) -> NDArray[np.float64]:
     """1 / (1 + exp(−x)) without overflow."""
     x = np.asarray(logits, dtype=np.float64)
-    e = np.exp(-np.abs(x))
-    return np.where(x >= 0, 1.0, e) / (1.0 + e)
+    with np.errstate(under="ignore"):
+        e = np.exp(-np.abs(x))
+        return np.where(x >= 0, 1.0, e) / (1.0 + e)
 
 
 @dataclass(frozen=True)
@@ -28,7 +32,8 @@ class Calibration:
 
     def probabilities(self, logits: ArrayLike) -> NDArray[np.float32]:
         """Probability (N,) float32 that a match is an inlier, from its logit (N,)."""
-        return sigmoid(self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
+        with np.errstate(under="ignore"):
+            return sigmoid(self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
 
 
 def largest_set_of_precision(scores: NDArray[np.float32], precision: float) -> NDArray[np.bool_]:
@@ -62,17 +67,19 @@ class AttributePrior:
 
     def logits(self, attributes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Logits (N,) float32 from encoded attributes (N, 8)."""
-        hidden = gelu(attributes.astype(np.float64) @ self.weight1.T + self.bias1)
-        return (hidden @ self.weight2 + self.bias2).astype(np.float32)
+        with np.errstate(all="ignore"):
+            hidden = gelu(attributes.astype(np.float64) @ self.weight1.T + self.bias1)
+            return (hidden @ self.weight2 + self.bias2).astype(np.float32)
 
 
 def gelu(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Gaussian error linear unit in its exact form, x · Φ(x)."""
-    z = np.abs(x) / np.sqrt(2.0)
-    k = 1.0 / (1.0 + _ERF_P * z)
-    polynomial = np.zeros_like(k)
-    for coefficient in _ERF_COEFFICIENTS:
-        polynomial = (polynomial + coefficient) * k
-    erf = np.sign(x) * (1.0 - polynomial * np.exp(-z * z))
-    activated: NDArray[np.float64] = 0.5 * x * (1.0 + erf)
+    with np.errstate(all="ignore"):
+        z = np.abs(x) / np.sqrt(2.0)
+        k = 1.0 / (1.0 + _ERF_P * z)
+        polynomial = np.zeros_like(k)
+        for coefficient in _ERF_COEFFICIENTS:
+            polynomial = (polynomial + coefficient) * k
+        erf = np.sign(x) * (1.0 - polynomial * np.exp(-z * z))
+        activated: NDArray[np.float64] = 0.5 * x * (1.0 + erf)
     return activated

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..errors import BackendError, ModelError
 from ..types import Providers
 from .backend import OUTPUT_NAMES, Float32Array, check_input, check_names
-from .metadata import ModelMetadata, check_model_file, parse_metadata
-from .onnx_file import read_onnx_file
+from .model_file import ModelFile, ModelMetadata
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -25,6 +24,7 @@ _LOG_ERRORS_ONLY = 3
 # moves across a nearest-neighbour choice moves logits by tenths. Without it all numbers of threads give the same bits.
 _DISABLED_OPTIMIZERS = ["MatMulScaleFusion"]
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"
+TELEMETRY_VARIABLE = "ORT_DISABLE_TELEMETRY"
 
 
 class OnnxBackend:
@@ -46,15 +46,14 @@ class OnnxBackend:
 
     def __init__(self, path: Path, providers: Providers | None = None) -> None:
         self._path, self._providers = path, providers
-        check_model_file(path)
-        file = read_onnx_file(path)
-        check_names(path, file.inputs, file.outputs)
-        self._metadata = parse_metadata(file.properties, path)
+        file = ModelFile.read(path)
+        check_names(file)
+        self._metadata = file.metadata()
         try:
-            import onnxruntime
+            runtime = _import_runtime()
         except Exception as error:  # a broken installation raises whatever its loader raises
             raise BackendError(f"ONNX Runtime cannot be imported ({error})") from error
-        self._session = _open_session(onnxruntime, path, providers)
+        self._session = _open_session(runtime, file, providers)
 
     @property
     def metadata(self) -> ModelMetadata:
@@ -79,8 +78,18 @@ class OnnxBackend:
         OnnxBackend.__init__(self, state["path"], state["providers"])
 
 
-def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnxruntime.InferenceSession:
-    """Open with the wanted providers, else on the CPU with one warning."""
+def _import_runtime() -> Any:
+    """ONNX Runtime, told not to report home: from 1.29 on it would on Linux as well, from the import on."""
+    wish = os.environ.setdefault(TELEMETRY_VARIABLE, "1")
+    import onnxruntime
+
+    if wish == "1":
+        onnxruntime.disable_telemetry_events()  # the caller may have imported it before
+    return onnxruntime
+
+
+def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) -> onnxruntime.InferenceSession:
+    """Open what was read with the wanted providers, else on the CPU with one warning."""
     options = _session_options(runtime)
     wanted = list(providers) if providers else [CPU_PROVIDER]
     names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
@@ -90,7 +99,7 @@ def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnx
     if usable and usable != [CPU_PROVIDER]:
         try:
             session = runtime.InferenceSession(
-                str(path), options, providers=usable, disabled_optimizers=_DISABLED_OPTIMIZERS
+                file.content, options, providers=usable, disabled_optimizers=_DISABLED_OPTIMIZERS
             )
             lost = [name for name in names if name not in missing and name not in session.get_providers()]
             reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
@@ -103,11 +112,11 @@ def _open_session(runtime: Any, path: Path, providers: Providers | None) -> onnx
         _warn_about_provider(reason)
     try:
         return runtime.InferenceSession(
-            str(path), options, providers=[CPU_PROVIDER], disabled_optimizers=_DISABLED_OPTIMIZERS
+            file.content, options, providers=[CPU_PROVIDER], disabled_optimizers=_DISABLED_OPTIMIZERS
         )
     except Exception as error:
         if type(error).__name__ in _FILE_ERRORS:
-            raise ModelError(f"{path}: not a readable ONNX model, truncated or damaged ({error})") from error
+            raise ModelError(f"{file.path}: not a readable ONNX model, truncated or damaged ({error})") from error
         raise BackendError(f"ONNX Runtime cannot start ({error})") from error
 
 

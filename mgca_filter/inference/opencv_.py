@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +9,8 @@ import cv2
 import numpy as np
 
 from ..errors import BackendError
-from .backend import INPUT_NAMES, OUTPUT_NAMES, Float32Array, check_input, check_names
-from .metadata import ModelMetadata, check_model_file, parse_metadata
-from .onnx_file import read_onnx_file
+from .backend import INPUT_NAMES, OUTPUT_NAMES, Float32Array, ProcessLock, check_input, check_names
+from .model_file import ModelFile, ModelMetadata
 
 MINIMUM_OPENCV = 5
 
@@ -34,17 +32,16 @@ class OpenCvBackend:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        check_model_file(path)
-        file = read_onnx_file(path)
-        check_names(path, file.inputs, file.outputs)
-        self._metadata = parse_metadata(file.properties, path)
+        file = ModelFile.read(path)
+        check_names(file)
+        self._metadata = file.metadata()
         if int(cv2.__version__.split(".")[0]) < MINIMUM_OPENCV:
             raise BackendError(
                 f"backend='opencv' needs OpenCV {MINIMUM_OPENCV} or newer, this is {cv2.__version__}: "
                 f"python -m pip install 'opencv-contrib-python-headless>={MINIMUM_OPENCV}', "
                 "or use backend='onnxruntime'"
             )
-        self._lock = threading.Lock()  # setInput and forward belong together
+        self._lock = ProcessLock()  # setInput and forward belong together
         try:
             # From the path: the overload that reads a buffer does not heed the engine.
             self._net: Any = cv2.dnn.readNetFromONNX(str(path), engine=cv2.dnn.ENGINE_NEW)

@@ -63,11 +63,12 @@ def select_network_input(
         tie_break = np.random.default_rng(seed).permutation(len(rows))
         ratio = np.where(attributes[rows, 5] > 0, attributes[rows, 0], 1.0)
         rows = np.sort(rows[np.lexsort((tie_break, ratio))[:MAX_NETWORK_MATCHES]])
-    return NetworkInput(
-        rows,
-        np.ascontiguousarray(correspondences[rows], dtype=np.float32),
-        np.ascontiguousarray(attributes[rows], dtype=np.float32),
-    )
+    with np.errstate(under="ignore"):  # coordinates next to zero, whatever the caller's np.seterr
+        return NetworkInput(
+            rows,
+            np.ascontiguousarray(correspondences[rows], dtype=np.float32),
+            np.ascontiguousarray(attributes[rows], dtype=np.float32),
+        )
 
 
 def run_network(backend: Backend, inputs: Sequence[NetworkInput]) -> list[NetworkOutput]:

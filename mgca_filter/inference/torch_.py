@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-import json
-import struct
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import BackendError, ModelError
+from ..errors import BackendError
 from .backend import Float32Array, check_input
-from .metadata import ModelMetadata, check_model_file, parse_metadata
+from .model_file import ModelFile, ModelMetadata
 
-_HEADER_LENGTH_BYTES = 8
+# The process that PyTorch's threads belong to: a child forked from it inherits their pool, but not the threads.
+_process = os.getpid()
 
 
 class TorchBackend:
     """The network itself, with the weights of a ``.safetensors`` file.
+
+    In a forked child it runs on one thread: PyTorch's others stay behind in the parent, and waiting for them would
+    last for ever.
 
     Args:
         path: the ``.safetensors`` file; its header carries the metadata that the ONNX file carries.
@@ -31,8 +34,7 @@ class TorchBackend:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        check_model_file(path)
-        self._metadata = parse_metadata(read_safetensors_metadata(path), path)
+        self._metadata = ModelFile.read(path).metadata()
         try:
             import torch
 
@@ -40,6 +42,7 @@ class TorchBackend:
         except Exception as error:  # a broken installation raises whatever its loader raises
             raise BackendError(f"PyTorch or safetensors cannot be imported ({error})") from error
         self._torch: Any = torch
+        _use_one_thread_after_a_fork(torch)
         self._network: Any = load_network(path).eval()
 
     @property
@@ -51,6 +54,7 @@ class TorchBackend:
         """One forward pass; see :class:`~mgca_filter.inference.backend.Backend`."""
         check_input(correspondences, attributes)
         torch = self._torch
+        _use_one_thread_after_a_fork(torch)
         try:
             with torch.inference_mode():
                 output = self._network(torch.from_numpy(correspondences), torch.from_numpy(attributes))
@@ -65,23 +69,9 @@ class TorchBackend:
         TorchBackend.__init__(self, state["path"])
 
 
-def read_safetensors_metadata(path: Path) -> dict[str, str]:
-    """The ``__metadata__`` of a safetensors file: eight bytes of length, then a JSON header, then the tensors.
-
-    Raises:
-        ModelError: the header is not there or the tensors that it lists are cut off.
-    """
-    try:
-        with path.open("rb") as file:
-            (length,) = struct.unpack("<Q", file.read(_HEADER_LENGTH_BYTES))
-            size = path.stat().st_size
-            if length > size:
-                raise ValueError("the header is longer than the file")
-            header: dict[str, Any] = json.loads(file.read(length))
-        properties = dict(header.pop("__metadata__", {}))
-        end = max((entry["data_offsets"][1] for entry in header.values()), default=0)
-        if _HEADER_LENGTH_BYTES + length + end > size:
-            raise ValueError("the tensors are cut off")
-    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ModelError(f"{path}: not a readable safetensors file, truncated or damaged ({error})") from error
-    return properties
+def _use_one_thread_after_a_fork(torch: Any) -> None:
+    """Once in each forked child, as PyTorch's own data loaders do."""
+    global _process
+    if os.getpid() != _process:
+        _process = os.getpid()
+        torch.set_num_threads(1)

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..inference.checksums import sha256_of
+from ..inference.model_file import sha256_of
 from ..match_filter import MatchFilter, model_path
 from .journal import Journal, PipelineError
 from .worker import (

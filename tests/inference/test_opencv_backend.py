@@ -1,4 +1,4 @@
-"""The ONNX file in OpenCV's DNN module, and what is read of the file without a runtime."""
+"""The ONNX file in OpenCV's DNN module."""
 
 from __future__ import annotations
 
@@ -12,13 +12,12 @@ import numpy as np
 import onnx
 import pytest
 from conftest import METADATA, Scene, build_model
-from export_tools import parity
-from test_backends import BackendContract, random_input
+from test_backends import BackendContract, ignores_threads, needs_fork, random_input, status_of_child
 
 import mgca_filter
 from mgca_filter import BackendError, ModelError, filter_matches
+from mgca_filter.export import parity
 from mgca_filter.inference import Backend, OpenCvBackend, open_backend, shared_backend
-from mgca_filter.inference.onnx_file import read_onnx_file
 
 opencv5 = pytest.mark.skipif(int(cv2.__version__.split(".")[0]) < 5, reason="the backend needs OpenCV 5")
 
@@ -70,6 +69,16 @@ def test_threads_do_not_mix_their_pairs(shipped: Backend) -> None:
 
 
 @opencv5
+@needs_fork
+@ignores_threads
+def test_a_child_forked_during_a_pass_does_not_wait_for_it(model_file: Path) -> None:
+    backend, inputs = OpenCvBackend(model_file), random_input(40)
+    expected = backend.infer(*inputs)[0]
+    with backend._lock:
+        assert status_of_child(lambda: np.testing.assert_array_equal(backend.infer(*inputs)[0], expected)) == 0
+
+
+@opencv5
 def test_filter_matches_runs_on_opencv(scene: Scene) -> None:
     arguments = {"attributes": scene.attributes, "threshold": 2.0}
     results = [
@@ -82,17 +91,17 @@ def test_filter_matches_runs_on_opencv(scene: Scene) -> None:
 
 
 @opencv5
-def test_onnx_runtime_is_not_needed() -> None:
+def test_onnx_runtime_is_not_needed(model_file: Path) -> None:
     program = (
         "import sys; sys.modules['onnxruntime'] = None\n"
         "import numpy as np, mgca_filter\n"
         "rng = np.random.default_rng(0)\n"
         "result = mgca_filter.filter_matches(rng.random((60, 2)) * 500, rng.random((60, 2)) * 500, None, "
-        "backend='opencv')\n"
+        "backend='opencv', model=sys.argv[1])\n"
         "assert result.info['backend'] == 'opencv'\n"
         "assert not {'onnx', 'torch'} & set(sys.modules)\n"
     )
-    subprocess.run([sys.executable, "-c", program], check=True)
+    subprocess.run([sys.executable, "-c", program, str(model_file)], check=True)
 
 
 def test_older_opencv_is_named_with_what_to_install(model_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,18 +138,3 @@ def test_contract_is_checked_without_a_runtime(tmp_path: Path) -> None:
         OpenCvBackend(build_model(tmp_path / "b.onnx", input_names=("points", "attributes")))
     with pytest.raises(ModelError, match="outputs"):
         OpenCvBackend(build_model(tmp_path / "c.onnx", output_names=("scores", "essential")))
-
-
-def test_the_file_reader_reads_what_onnx_reads(tmp_path: Path) -> None:
-    metadata = {"plain": "text", "empty": "", "umlaut": "Größe", "long": "x" * 70_000}
-    path = build_model(tmp_path / "m.onnx", metadata)
-    file, model = read_onnx_file(path), onnx.load(str(path))
-    assert file.properties == metadata == {entry.key: entry.value for entry in model.metadata_props}
-    assert file.inputs == [value.name for value in model.graph.input]
-    assert file.outputs == [value.name for value in model.graph.output]
-
-
-def test_the_metadata_of_the_shipped_model_are_read_whole() -> None:
-    path = mgca_filter.model_path()
-    file = read_onnx_file(path)
-    assert file.properties == {entry.key: entry.value for entry in onnx.load(str(path)).metadata_props}
