@@ -138,7 +138,12 @@ class Workers:
             ) from error
 
     def __enter__(self) -> Workers:
-        self._parallel.__enter__()
+        try:
+            self._parallel.__enter__()
+        except BaseException:  # such as a cluster of fewer processors than workers
+            if self._ray is not None:
+                self._ray.shutdown()
+            raise
         return self
 
     def __exit__(
