@@ -89,6 +89,8 @@ class PairInput:
 
     def fundamental_in_units(self, F: NDArray[np.float64]) -> NDArray[np.float64]:
         """F (3, 3) for pixels as one for the caller's coordinates, of unit Frobenius norm."""
+        if self.unit_px == 1.0:
+            return F
         unit = np.diag([self.unit_px, self.unit_px, 1.0])
         F = unit @ F @ unit
         return np.asarray(F / np.linalg.norm(F), dtype=np.float64)
