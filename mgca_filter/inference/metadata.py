@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
+from ..fit.choice import check_coefficients
 from ..inputs.attributes import ATTRIBUTE_COUNT
 from .calibration import AttributePrior, Calibration
 from .checksums import check_checksum, sha256_of
 
-CONTRACT_VERSION = "1"
+CONTRACT_VERSION = "2"
 # The largest preset takes 20 MB; more than this is another file, and is not read into memory.
 MAX_MODEL_BYTES = 2**29
 _TEXT_KEYS = (
@@ -36,6 +37,7 @@ METADATA_KEYS = (
     "decision_threshold",
     "candidate_rule",
     "prior",
+    "choice",
 )
 
 
@@ -50,6 +52,7 @@ class ModelMetadata:
         decision_threshold: a match above this logit counts as accepted.
         candidate_max_ratio, candidate_min_count: which matches enter the network (``candidate_mask``).
         prior: scores of the matches that do not.
+        choice: coefficients of the choice among hypotheses and of its confidence (``fit/choice.py``).
         sha256: of the model file, hexadecimal.
     """
 
@@ -67,6 +70,7 @@ class ModelMetadata:
     candidate_max_ratio: float
     candidate_min_count: int
     prior: AttributePrior
+    choice: dict[str, list[float]]
     sha256: str
 
 
@@ -96,6 +100,8 @@ def parse_metadata(properties: Mapping[str, str], path: Path) -> ModelMetadata:
         max_ratio, min_count = _finite(rule["max_ratio"]), int(rule["min_count"])
         key = "prior"
         prior = _parse_prior(json.loads(properties[key]))
+        key = "choice"
+        choice = check_coefficients(json.loads(properties[key]))
     except (ValueError, TypeError, KeyError) as error:
         raise ModelError(f"{path}: metadata '{key}' cannot be read ({type(error).__name__}: {error})") from error
     return ModelMetadata(
@@ -106,6 +112,7 @@ def parse_metadata(properties: Mapping[str, str], path: Path) -> ModelMetadata:
         candidate_max_ratio=max_ratio,
         candidate_min_count=min_count,
         prior=prior,
+        choice=choice,
         sha256=sha256_of(path),
     )
 
