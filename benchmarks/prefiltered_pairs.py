@@ -20,7 +20,7 @@ from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.methods import Answer, Method
 from mgca_filter.evaluation.metrics import POSE_STATISTICS, FloatArray, pool_pairs, true_matches
 from mgca_filter.evaluation.our_rows import ProductMethod, filter_pair, model_settings
-from mgca_filter.evaluation.pairs import SceneSelection, iterate_pairs, select_pairs
+from mgca_filter.evaluation.pairs import SceneSelection, select_pairs
 from mgca_filter.evaluation.predict import SceneOutcomes, predict
 from mgca_filter.evaluation.registry import parse_method
 from mgca_filter.evaluation.selection import Selection
@@ -28,7 +28,6 @@ from mgca_filter.evaluation.store import ResultStore
 from mgca_filter.evaluation.summarize import scene_errors
 from mgca_filter.tables import render_table
 
-from .fit_ablation import compare_runs, run_table
 from .study import drawn_pairs, paired_cells, run_study, study_parser
 
 EASY_SHARE = 0.3
@@ -129,18 +128,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print three tables: easy pairs, which run of the fit gave the answers on them, prefiltered pairs.
-
-    ``--per-scene`` and ``--seed`` draw for the last one.
-    """
+    """Print two tables: easy pairs, and prefiltered pairs, for which ``--per-scene`` and ``--seed`` draw."""
     photographed, rendered = (select_pairs(path) for path in (options.bundles, options.rendered))
     groups = {"photographs, easy": easy_pairs(photographed), "rendered, easy": easy_pairs(rendered)}
     groups["rendered, all"] = rendered
     groups = {name: selections for name, selections in groups.items() if selections}
     store = ResultStore(options.store)
     print(easy_table(groups, options.model, store), flush=True)
-    compared = {name: compare_runs(iterate_pairs(group), options.model) for name, group in groups.items()}
-    print("\n" + run_table(compared), flush=True)
     print("\n" + prefiltered_table(drawn_pairs(options), options.model, store))
     return 0
 

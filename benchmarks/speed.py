@@ -28,7 +28,7 @@ from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.data.source import read_image
 from mgca_filter.evaluation.metrics import FAILURE_DEG, true_matches
 from mgca_filter.fit.robust_fit import pose_from_essential
-from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
@@ -114,7 +114,7 @@ def bundle_pair(path: Path, index: int) -> RawPair:
 def magsac(pair: RawPair, iterations: int) -> Any:
     """The call that the filter replaces, at one pixel: E and mask."""
     x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
-    threshold = 1.0 / float(np.mean([pair.K1[0, 0], pair.K1[1, 1], pair.K2[0, 0], pair.K2[1, 1]]))
+    threshold = 1.0 / mean_focal_length(pair.K1, pair.K2)
     return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, iterations)
 
 
@@ -124,7 +124,11 @@ def answer_error_deg(pair: RawPair, answer: Any) -> float | None:
         pose = None if answer.R is None or answer.t is None else (answer.R, answer.t)
     elif isinstance(answer, tuple):
         E, mask = answer
-        pose = None if E is None else pose_from_essential(E[:3], pair.correspondences[mask.ravel() > 0])
+        pose = (
+            None
+            if E is None
+            else pose_from_essential(E[:3], pair.correspondences[mask.ravel() > 0], mean_focal_length(pair.K1, pair.K2))
+        )
     else:
         return None
     return FAILURE_DEG if pose is None else pose_error_deg(*pose, pair.R, pair.t)

@@ -11,13 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .fit.ranking import RankedMatches, match_order
-from .fit.robust_fit import MIN_MATCHES, RobustFitOptions, estimate_model
+from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
+from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge
-from .inference import BACKENDS, Backend, shared_backend
+from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
-from .inference.scoring import NetworkInput, NetworkOutput, assemble_logits, run_network, select_network_input
-from .inputs.attributes import Column, MatchAttributes
+from .inference.scoring import (
+    INVALID_LOGIT,
+    NetworkInput,
+    NetworkOutput,
+    assemble_logits,
+    run_network,
+    select_network_input,
+)
+from .inputs.attributes import MatchAttributes
 from .inputs.options import FilterOptions, check_choice, check_path, check_providers, method_name
 from .inputs.pair import MatchPair, PairInput, prepare_pair
 from .result import FilterResult, Status
@@ -37,7 +44,7 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold, keep_precision, confidence, method, max_iterations, model, providers, backend, seed: as in
+        threshold, keep_precision, confidence, method, effort, max_iterations, model, providers, backend, seed: as in
             :func:`filter_matches`.
 
     Raises:
@@ -54,6 +61,7 @@ class MatchFilter:
         keep_precision: float | None = FilterOptions.keep_precision,
         confidence: float = FilterOptions.confidence,
         method: str | int = FilterOptions.method,
+        effort: str = FilterOptions.effort,
         max_iterations: int = FilterOptions.max_iterations,
         model: str | Path | None = None,
         providers: Providers | None = None,
@@ -61,8 +69,15 @@ class MatchFilter:
         seed: int = FilterOptions.seed,
     ) -> None:
         check_choice(backend, BACKENDS, "backend")
-        self.options = FilterOptions(threshold, keep_precision, confidence, method_name(method), max_iterations, seed)
-        self.fit_options = RobustFitOptions.of(self.options)
+        self.options = FilterOptions(
+            threshold=threshold,
+            keep_precision=keep_precision,
+            confidence=confidence,
+            method=method_name(method),
+            effort=effort,
+            max_iterations=max_iterations,
+            seed=seed,
+        )
         self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
 
     @classmethod
@@ -70,9 +85,13 @@ class MatchFilter:
         """A filter over a backend that is open already, such as a network that is being trained."""
         match_filter = cls.__new__(cls)
         match_filter.options = FilterOptions() if options is None else options
-        match_filter.fit_options = RobustFitOptions.of(match_filter.options)
         match_filter._backend = backend
         return match_filter
+
+    @property
+    def metadata(self) -> ModelMetadata:
+        """What the model file says of itself."""
+        return self._backend.metadata
 
     def filter(
         self,
@@ -109,9 +128,10 @@ class MatchFilter:
         jobs = [self._start(pair, index) for index, pair in enumerate(pairs)]
         by_count: dict[int, list[_Job]] = {}
         for job in jobs:
-            by_count.setdefault(len(job.sent.rows), []).append(job)
-        for count, group in by_count.items():
-            for first in range(0, len(group) if count else 0, _BATCH_PAIRS):
+            if job.sent is not None and len(job.sent.rows):
+                by_count.setdefault(len(job.sent.rows), []).append(job)
+        for group in by_count.values():
+            for first in range(0, len(group), _BATCH_PAIRS):
                 self._run_batch(group[first : first + _BATCH_PAIRS])
         return [self._finish(job) for job in jobs]
 
@@ -123,15 +143,24 @@ class MatchFilter:
         if not isinstance(pair, MatchPair):
             raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
         prepared = prepare_pair(pair)
-        sent = select_network_input(
-            prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.options.seed
-        )
-        return _Job(prepared, sent, timings_ms={"prepare": _milliseconds_since(started)})
+        job = _Job(prepared, timings_ms={"prepare": _milliseconds_since(started)})
+        started = time.perf_counter()
+        if self.options.method != "none":
+            job.evidence = gather_before(prepared)
+            job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
+            if self.options.method == "auto" and self.options.effort == "auto":
+                job.model = job.search.before_network()
+            job.timings_ms["fit"] = _milliseconds_since(started)
+        if job.model is None:
+            job.sent = select_network_input(
+                prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.options.seed
+            )
+        return job
 
     def _run_batch(self, jobs: list[_Job]) -> None:
         """Step 3: one forward pass."""
         started = time.perf_counter()
-        outputs = run_network(self._backend, [job.sent for job in jobs])
+        outputs = run_network(self._backend, [job.sent for job in jobs if job.sent is not None])
         elapsed = _milliseconds_since(started) / len(jobs)
         for job, output in zip(jobs, outputs):
             job.output = output
@@ -139,19 +168,18 @@ class MatchFilter:
 
     def _finish(self, job: _Job) -> FilterResult:
         """Steps 4 to 7: scores, robust fit on the best of them, re-test of all matches, verdict."""
-        pair, metadata = job.pair, self._backend.metadata
-        logits = assemble_logits(pair.attributes, pair.valid, job.sent, job.output, self._backend)
-        scores = np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
-        model = None
+        pair = job.pair
+        if job.model is None:
+            logits, scores = self._score(job)
+            self._fit(job, logits, scores)
+        else:
+            logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
-        if self.options.method == "none":
+        if job.evidence is None:
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
-            ranked = self._rank(pair, job.sent, logits, scores)
-            model = estimate_model(ranked, pair.focal_px, self.fit_options, pair.calibrated, job.network_essential)
-            job.timings_ms["fit"] = _milliseconds_since(started)
-            started = time.perf_counter()
-            verdict = judge(pair, model, ranked, pair.threshold_px(self.options.threshold), self.fit_options)
+            threshold_px, choice = pair.threshold_px(self.options.threshold), self._backend.metadata.choice
+            verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
             if self.options.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
@@ -165,30 +193,37 @@ class MatchFilter:
             t=verdict.t,
             status=verdict.status,
             num_inliers=int(np.count_nonzero(verdict.mask)),
+            confidence=None if verdict.R is None or job.model is None else job.model.confidence,
             points1=pair.points1,
             points2=pair.points2,
             indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
-            info={
-                **self._describe(job),
-                "logits": logits,
-                "fitted_essential": None if model is None else model.E,
-                "origin": None if model is None else model.origin,
-                **verdict.info,
-            },
+            info={**self._describe(job), "logits": logits, **verdict.info},
         )
 
-    def _rank(
-        self, pair: PairInput, sent: NetworkInput, logits: NDArray[np.float32], scores: NDArray[np.float32]
-    ) -> RankedMatches:
-        """What the network saw, in the order in which the robust fit draws."""
-        margins = logits - self._backend.metadata.decision_threshold
-        rows = sent.rows
-        order = rows[
-            match_order(
-                margins[rows], pair.attributes[rows, Column.RATIO], pair.attributes[rows, Column.RATIO_KNOWN] > 0
-            )
-        ]
-        return RankedMatches.of(pair.correspondences, order, scores, margins)
+    def _score(self, job: _Job) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Logits and scores (M,), (M,) of the network."""
+        pair, metadata = job.pair, self._backend.metadata
+        assert job.sent is not None
+        logits = assemble_logits(pair.attributes, pair.valid, job.sent, job.output, self._backend)
+        return logits, np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
+
+    def _fit(self, job: _Job, logits: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
+        """The model on what the network saw."""
+        if job.search is None or job.sent is None:
+            return
+        started = time.perf_counter()
+        margins = logits - np.float32(self._backend.metadata.decision_threshold)
+        job.evidence = gather_scored(job.pair, job.sent.rows, scores, margins, job.network_essential)
+        job.model = job.search.with_network(job.evidence)
+        job.timings_ms["fit"] += _milliseconds_since(started)
+
+    def _score_by_residuals(
+        self, pair: PairInput, model: TwoViewModel
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """The same (M,), (M,) of a pair that needed no network: how likely each residual is among right matches."""
+        metadata = self._backend.metadata
+        scores = scores_by_residuals(pair, model, metadata.choice)
+        return np.where(pair.valid, metadata.calibration.logits(scores), np.float32(INVALID_LOGIT)), scores
 
     def _keep_by_scores(self, pair: PairInput, scores: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Mask (M,) that asks the network alone."""
@@ -207,8 +242,12 @@ class MatchFilter:
             "model_sha256": self._backend.metadata.sha256,
             "intrinsics": "given" if job.pair.calibrated else "guessed",
             "assumptions": list(job.pair.assumptions),
-            "num_network_matches": len(job.sent.rows),
+            "num_network_matches": 0 if job.sent is None else len(job.sent.rows),
+            "network_rows": np.zeros(0, dtype=np.intp) if job.sent is None else job.sent.rows,
             "network_essential": job.network_essential,
+            "fitted_essential": None if job.model is None else job.model.E,
+            "origin": None if job.model is None else job.model.origin,
+            "ended": None if job.model is None else job.model.ended,
         }
 
 
@@ -217,8 +256,11 @@ class _Job:
     """One pair on its way through the steps."""
 
     pair: PairInput
-    sent: NetworkInput
     timings_ms: dict[str, float]
+    evidence: Evidence | None = None
+    search: Search | None = None
+    model: TwoViewModel | None = None
+    sent: NetworkInput | None = None
     output: NetworkOutput | None = None
 
     @property
@@ -242,6 +284,7 @@ def filter_matches(
     keep_precision: float | None = FilterOptions.keep_precision,
     confidence: float = FilterOptions.confidence,
     method: str | int = FilterOptions.method,
+    effort: str = FilterOptions.effort,
     max_iterations: int = FilterOptions.max_iterations,
     attributes: MatchAttributes | None = None,
     K: MatrixLike | None = None,
@@ -269,9 +312,12 @@ def filter_matches(
             their scores, is at least this (above 0, below 1), whatever their distance to the model. All False where
             there is no model, as ever.
         confidence: of the robust fit, between 0 and 1.
-        method: robust fit: ``"prosac"``, ``"magsac"``, ``"ransac"`` (or ``cv2.USAC_PROSAC``, ``cv2.USAC_MAGSAC``,
-            ``cv2.RANSAC``), ``"poselib"`` (needs that package), or ``"none"``, which returns scores and a mask of
-            scores above 0.5 (or by ``keep_precision``), no geometry.
+        method: robust fit: ``"auto"``, several unlike estimators and the most likely of what they find;
+            ``"poselib"``, PoseLib's (needs that package) among them; ``"prosac"``, ``"magsac"``, ``"ransac"`` (or
+            ``cv2.USAC_PROSAC``, ``cv2.USAC_MAGSAC``, ``cv2.RANSAC``), that one alone on what the network accepts; or
+            ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
+        effort: ``"auto"`` leaves the network out where a run on the list alone explains it, and takes the scores from
+            the residuals; ``"full"`` always runs it.
         max_iterations: largest number of samples that one run of a robust estimator draws.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         K: another way to say that both images share ``K1``.
@@ -296,6 +342,7 @@ def filter_matches(
         keep_precision=keep_precision,
         confidence=confidence,
         method=method,
+        effort=effort,
         max_iterations=max_iterations,
         model=model,
         providers=providers,

@@ -52,15 +52,20 @@ class FilterResult:
         R, t: (3, 3) rotation and (3,) unit translation, or None.
         status: the verdict.
         num_inliers: number of True in ``mask``.
+        confidence: calibrated probability that the pose is within 10 degrees of the truth, in rotation and in
+            direction; None where there is no pose, or no intrinsics to trust.
         points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
-            ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches``,
+            ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
+            ``network_rows`` (those that entered the network),
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
-            robust fit left it, before the verdict, and its ``origin`` ("network", "start 1", …, "plane"). Where they
-            were measured: ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography``
-            (3, 3) that explains the pair, ``focal_factor`` where the matches ask for focal lengths that many times
-            those given (rough, a power of 1.2).
+            robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",
+            "network", "accepted", "score order", …, "plane"), and where the search ``ended`` ("before the network",
+            where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:
+            ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography`` (3, 3) that
+            explains the pair, ``focal_factor`` where the matches ask for focal lengths that many times those given
+            (rough, a power of 1.2).
     """
 
     mask: NDArray[np.bool_]
@@ -72,6 +77,7 @@ class FilterResult:
     t: NDArray[np.float64] | None
     status: Status
     num_inliers: int
+    confidence: float | None = None
     points1: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     points2: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
     indices: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
@@ -129,4 +135,6 @@ class FilterResult:
 
     def __repr__(self) -> str:
         """The verdict and the counts; the arrays would fill the screen."""
-        return f"FilterResult(status={self.status.value!r}, {self.num_inliers} of {len(self.mask)} matches kept)"
+        confidence = "" if self.confidence is None else f", confidence {self.confidence:.2f}"
+        kept = f"{self.num_inliers} of {len(self.mask)} matches kept"
+        return f"FilterResult(status={self.status.value!r}, {kept}{confidence})"

@@ -15,6 +15,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from mgca_filter import MatchFilter
+from mgca_filter.fit.choice import fitted_coefficients
 from mgca_filter.geometry.epipolar import essential_from_pose
 from mgca_filter.geometry.pose_refinement import rotation_from_vector
 from mgca_filter.inputs.attributes import MatchAttributes
@@ -86,7 +87,7 @@ def make_scene(kind: str = "general", right: int = 120, wrong: int = 80, noise_p
 
 
 METADATA = {
-    "contract_version": "1",
+    "contract_version": "2",
     "name": "ratio_test",
     "version": "0",
     "git_commit": "none",
@@ -98,6 +99,7 @@ METADATA = {
     "decision_threshold": "0.0",
     "candidate_rule": json.dumps({"max_ratio": 0.95, "min_count": 32}),
     "prior": json.dumps({"weight1": [[1.0, 0, 0, 0, 0, 0, 0, 0]], "bias1": [0.0], "weight2": [-8.0], "bias2": 3.0}),
+    "choice": json.dumps(fitted_coefficients()),
     "license": "none",
     "minimum_onnxruntime": "1.17",
 }

@@ -16,10 +16,10 @@ import onnx
 import pytest
 from conftest import METADATA, SIDEWAYS, SIZE, K, build_model
 from cpp_program import BUILD_TIMEOUT, SOURCE, Pair, assert_same_answer, build, build_program
+from mgca_filter.fit.ranking import RankedMatches, match_order
 
 import mgca_filter
 from mgca_filter.fit import robust_fit
-from mgca_filter.fit.ranking import RankedMatches, match_order
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
 from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector
 

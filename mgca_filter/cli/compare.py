@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fit.ranking import RankedMatches
-from ..fit.robust_fit import SINGLE_START, RobustFitOptions, estimate_model
+from ..fit.evidence import Evidence, one_to_one
+from ..fit.robust_fit import fit_alone
 from ..geometry.cameras import mean_focal_length, resolve_intrinsics
 from ..geometry.epipolar import rotation_error_deg, sampson_distance
+from ..inputs.options import FilterOptions
 from ..result import FilterResult
 
 BASELINES = {"RANSAC": "ransac", "MAGSAC": "magsac"}
@@ -67,12 +68,19 @@ def fit_baselines(
     focal_px = mean_focal_length(camera1.K, camera2.K)
     fits = []
     for name, method in BASELINES.items():
-        options = RobustFitOptions(
-            method=method, threshold_px=threshold_px, confidence=0.999, seed=seed, starts=SINGLE_START, refine=False
-        )
         start = time.perf_counter()
-        matches = RankedMatches.of(correspondences, np.arange(len(correspondences)))
-        model = estimate_model(matches, focal_px, options, calibrated=not camera1.guessed)
+        rows = one_to_one(correspondences, np.arange(len(correspondences)))
+        evidence = Evidence(
+            rows,
+            correspondences[rows],
+            np.ones(len(rows), dtype=bool),
+            np.full(len(rows), np.nan),
+            focal_px,
+            calibrated=not camera1.guessed,
+        )
+        model = fit_alone(
+            evidence, method, threshold_px, FilterOptions(confidence=0.999, max_iterations=5000, seed=seed)
+        )
         fit_ms = 1e3 * (time.perf_counter() - start)
         if model is None:
             fits.append(BaselineFit(name, np.zeros(len(points1), bool), None, None, None, fit_ms))

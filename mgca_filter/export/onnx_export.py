@@ -16,6 +16,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from ..fit.choice import fitted_coefficients
 from ..inference.backend import INPUT_NAMES, OUTPUT_NAMES
 from ..inference.calibration import Calibration
 from ..inference.model_file import CONTRACT_VERSION, METADATA_KEYS
@@ -132,6 +133,7 @@ def model_metadata(network: MGCANet, description: ModelDescription) -> dict[str,
         "decision_threshold": repr(description.decision_threshold),
         "candidate_rule": json.dumps(rule),
         "prior": json.dumps(_prior_weights(network.prior)),
+        "choice": json.dumps(fitted_coefficients()),
         "license": description.license,
         "minimum_onnxruntime": MINIMUM_ONNXRUNTIME,
     }

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..geometry.epipolar import homogeneous, sampson_distance
 from ..geometry.homography import homography_distance
-from .ranking import distinct_rows
+from .evidence import distinct_rows
 
 Array = NDArray[np.float64]
 

@@ -1,7 +1,7 @@
-"""OpenCV's and PoseLib's estimators of the essential and the fundamental matrix: one call, one model or None.
+"""OpenCV's and PoseLib's robust estimators of two-view models: one call, one model or None.
 
-With ``homography.py`` the only caller of robust estimators. Points lie on the normalised image planes; thresholds
-come in pixels with the mean focal length that converts them.
+The only caller of robust estimators. Points lie on the normalised image planes; thresholds come in pixels with the mean
+focal length that converts them.
 """
 
 from __future__ import annotations
@@ -15,17 +15,20 @@ from numpy.typing import NDArray
 
 from ..geometry.epipolar import essential_from_pose, sampson_distance
 
-# A homography constrains both coordinates and planes are seldom perfect: it gets twice the threshold of E.
-HOMOGRAPHY_THRESHOLD_FACTOR = 2.0
-# With this local optimisation UsacParams returns, at seed 0, the very bits of OpenCV's USAC_PROSAC preset, which
-# cannot be seeded itself.
-_LO_ITERATIONS, _LO_SAMPLE_SIZE = 20, 12
-_CONFIDENCE, _MAX_ITERATIONS = 0.999, 1000
-
 Array = NDArray[np.float64]
 
-# Behind the network hardly a sample is spoiled: PoseLib's own 1000 buy nothing but time.
-_POSELIB_MIN_ITERATIONS = 50
+# A homography constrains both coordinates and planes are seldom perfect: it gets twice the threshold of E.
+HOMOGRAPHY_THRESHOLD_FACTOR = 2.0
+_HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS = 0.999, 1000
+# OpenCV's presets USAC_PROSAC and USAC_MAGSAC, which cannot be seeded themselves: with these settings UsacParams gives
+# their very bits at seed 0. Sampler, score, local optimisation with its iterations and sample size.
+_PRESETS = {
+    "prosac": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
+    "magsac": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MAGSAC, cv2.LOCAL_OPTIM_SIGMA, 10, 14),
+    "homography": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
+}
+# PoseLib may take ten times as many before it gives up, which takes seconds.
+_POSELIB_MAX_ITERATIONS = 10_000
 # Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
 _find_homography = cv2.findHomography
@@ -33,7 +36,7 @@ _find_homography = cv2.findHomography
 
 @dataclass(frozen=True)
 class EstimatorOptions:
-    """Options of one call.
+    """Options of one run.
 
     Attributes:
         method: ``"prosac"``, ``"magsac"``, ``"ransac"`` or ``"poselib"``; PROSAC and PoseLib use the order.
@@ -86,10 +89,7 @@ def _fit_opencv(rows: Array, focal_px: float, options: EstimatorOptions, calibra
         elif options.method == "ransac":
             M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
         else:
-            prosac = options.method == "prosac"
-            sampler = cv2.SAMPLING_PROSAC if prosac else cv2.SAMPLING_UNIFORM
-            score = cv2.SCORE_METHOD_MSAC if prosac else cv2.SCORE_METHOD_MAGSAC
-            params = usac_params(sampler, score, threshold, *limits, options.seed)
+            params = usac_params(options.method, threshold, *limits, options.seed)
             if calibrated:
                 # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
                 M, _ = _find_essential_mat(x1, x2, np.eye(3), np.eye(3), None, None, params)
@@ -109,11 +109,13 @@ def _best_of_stack(M: Any, scale: Array, rows: Array, threshold: float) -> Array
     if M is None or np.size(M) == 0 or np.size(M) % 9:
         return None
     models = [scale @ m @ scale for m in np.reshape(M, (-1, 3, 3)) if np.isfinite(m).all() and np.any(m)]
-    costs = [np.sum(np.minimum(sampson_distance(rows, m), threshold) ** 2) for m in models]
     if not models:
         return None
-    best = np.asarray(models[int(np.argmin(costs))], dtype=np.float64)
-    return best / float(np.linalg.norm(best))
+    best = 0
+    if len(models) > 1:
+        best = int(np.argmin([np.sum(np.minimum(sampson_distance(rows, m), threshold) ** 2) for m in models]))
+    model = np.asarray(models[best], dtype=np.float64)
+    return model / float(np.linalg.norm(model))
 
 
 def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibrated: bool) -> Array | None:
@@ -126,8 +128,8 @@ def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibr
         "max_epipolar_error": options.threshold_px,
         "progressive_sampling": True,
         "success_prob": options.confidence,
-        "max_iterations": options.max_iterations,
-        "min_iterations": min(_POSELIB_MIN_ITERATIONS, options.max_iterations),
+        "max_iterations": min(options.max_iterations, _POSELIB_MAX_ITERATIONS),
+        "min_iterations": min(1000, options.max_iterations),
         "seed": options.seed,
     }
     # One camera of the mean focal length puts PoseLib's thresholds in the pixels that this package uses.
@@ -142,14 +144,10 @@ def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibr
     return _best_of_stack(essential_from_pose(pose.R, pose.t), np.eye(3), rows, options.threshold_px / focal_px)
 
 
-def usac_params(
-    sampler: int, score: int, threshold: float, confidence: float, max_iterations: int, seed: int
-) -> cv2.UsacParams:
-    """OpenCV's estimator settings; ``sampler`` and ``score`` are ``cv2.SAMPLING_*`` and ``cv2.SCORE_METHOD_*``."""
+def usac_params(preset: str, threshold: float, confidence: float, max_iterations: int, seed: int) -> cv2.UsacParams:
+    """OpenCV's settings of one of :data:`_PRESETS`."""
     params = cv2.UsacParams()
-    params.sampler, params.score = sampler, score
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    params.loIterations, params.loSampleSize = _LO_ITERATIONS, _LO_SAMPLE_SIZE
+    params.sampler, params.score, params.loMethod, params.loIterations, params.loSampleSize = _PRESETS[preset]
     params.threshold, params.confidence = threshold, confidence
     params.maxIterations, params.randomGeneratorState = max_iterations, seed % 2**31
     return params
@@ -165,7 +163,7 @@ def fit_homography(points1: Array, points2: Array, threshold: float, seed: int =
         return None
     # OpenCV holds some constants in pixels: in units of the threshold, any coordinates look like pixels to it.
     scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
-    params = usac_params(cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, 1.0, _CONFIDENCE, _MAX_ITERATIONS, seed)
+    params = usac_params("homography", 1.0, _HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS, seed)
     try:
         H, _ = _find_homography(points1 / threshold, points2 / threshold, params)
     except cv2.error:

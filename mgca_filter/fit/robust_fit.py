@@ -1,17 +1,14 @@
-"""Robust fit of the two-view model to scored matches: several starts beside the network's own answer, refined, and the
-choice between them.
+"""The robust fit: what is proposed, refined, chosen, in this order.
 
-All points are on the normalised image planes and thresholds come in pixels with the mean focal length that
-converts them. With intrinsics that can be trusted the model is an essential matrix; with guessed ones it is a
-fundamental matrix, estimated in the same coordinates because they condition it well.
+An easy pair ends before the network: a run or two on the list alone explain it, no other pose comes near, and its
+inliers hold it firmly. Otherwise unlike sources propose; where the first of them agree, the others are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
-from typing import Any
+from math import acos, degrees
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,93 +16,74 @@ from numpy.typing import NDArray
 from ..geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
-    pose_error_deg,
     project_to_essential,
     sampson_distance,
-    triangulated_depths,
 )
-from ..geometry.homography import poses_from_homography
 from ..geometry.pose_refinement import refine_pose
 from ..inputs.options import FilterOptions
-from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
-from .ranking import RankedMatches
+from ..inputs.pair import PairInput
+from . import choice, sources
+from .choice import Coefficients, Hypotheses, Judgement, Residuals
+from .estimators import EstimatorOptions
+from .evidence import ACCEPTED_SCORE, MIN_MATCHES, Evidence, listed_rows
+from .sources import Family, Proposal
 
 Array = NDArray[np.float64]
 
-MIN_MATCHES = 8
-# A pose from the dominant plane is worth refining when it starts with this share of the support to beat.
-RIVAL_SUPPORT_SHARE = 0.5
-# Two starts that end this close together, both with this share of the best support, have found the answer.
-AGREEMENT_DEG, AGREEMENT_SUPPORT_SHARE = 1.0, 0.97
+REFINE_PX = 1.0
+# A hypothesis this close to a refined one would end there; one this close to the best is no twin of it.
+SAME_DEG, TWIN_DEG = 0.3, 2.0
+# The early end is given up where a run explains less than the first share of the list; above the second, one will do.
+PROMISING, CERTAIN = 0.3, 0.7
+# A twin that explains less than this share of what the best pose does, before it is refined, is no rival.
+TWIN_SHARE = 0.5
+
+# What needs no network; then what uses it; then what is still tried where those do not settle it.
+BEFORE_NETWORK = (
+    Proposal("list", Family.LIST_UNIFORM, sources.listed, "magsac", 0.5, 300, 0),
+    Proposal("list, 1 px", Family.LIST_UNIFORM, sources.listed, "magsac", 1.0, 300, 4),
+)
+FIRST = (
+    Proposal("network", Family.NETWORK, sources.network),
+    Proposal("accepted", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 300, 1),
+    Proposal("score order", Family.SCORE_ORDER, sources.above(-1.0), "prosac", 1.0, 1000, 0),
+)
+SECOND = (
+    BEFORE_NETWORK[1],
+    Proposal("list order", Family.LIST_ORDERED, sources.listed, "prosac", 0.5, 1000, 0),
+    Proposal("score order, all", Family.SCORE_ORDER, sources.above(-2.0), "prosac", 0.5, 1000, 3),
+    Proposal("score order, fine", Family.SCORE_ORDER, sources.above(-1.0), "prosac", 0.5, 1000, 1),
+    Proposal("score order, best", Family.SCORE_ORDER, sources.above(0.0), "prosac", 1.0, 1000, 2),
+    Proposal("accepted, more", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 1000, 3),
+)
+POSELIB = Proposal("PoseLib", Family.POSELIB, sources.listed, "poselib", 0.75, 10_000, 0)
+# One robust estimator alone, for those who ask for it.
+ALONE = {
+    "prosac": Proposal("prosac", Family.SCORE_ORDER, sources.above(-1.0), "prosac", 0.5, 5000, 0),
+    "magsac": Proposal("magsac", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 5000, 0),
+    "ransac": Proposal("ransac", Family.ACCEPTED, sources.accepted, "ransac", 0.5, 5000, 0),
+}
 
 
 @dataclass(frozen=True)
-class Start:
-    """One run of the estimator.
+class Plan:
+    """Which sources propose, and when.
 
     Attributes:
-        margin: it sees the matches whose logit lies above the decision threshold by more than this.
-        threshold_factor: its threshold in multiples of the fit's.
+        before: those that need no network, one after the other. first: those that use it.
+        second: those that are tried where the first do not settle it.
+        twins: propose the twin that the dominant plane allows as well.
+        settle: leave the second out where the first agree.
     """
 
-    margin: float = 0.0
-    threshold_factor: float = 1.0
+    before: tuple[Proposal, ...] = BEFORE_NETWORK
+    first: tuple[Proposal, ...] = FIRST
+    second: tuple[Proposal, ...] = SECOND
+    twins: bool = True
+    settle: bool = True
 
 
-# Estimators stop at the first model that looks good enough and miss better ones; what they see decides which they
-# meet. Up to four views of the matches, and the choice by support, find most of what any one of them would.
-STARTS = (Start(-1.0, 2.0), Start(-1.0, 1.0), Start(0.0, 2.0), Start(-2.0, 1.0))
-# PoseLib samples more thoroughly and takes longer: one is enough.
-POSELIB_STARTS = (STARTS[2],)
-SINGLE_START = (Start(),)
-
-
-@dataclass(frozen=True)
-class RobustFitOptions:
-    """Options of the robust fit.
-
-    Attributes:
-        method: ``"prosac"``, ``"magsac"``, ``"ransac"`` or ``"poselib"``; PROSAC and PoseLib use the order.
-        threshold_px: Sampson distance that the estimator takes for an inlier, pixels.
-        confidence: probability that a sample without outliers was drawn.
-        max_iterations: largest number of samples of a start.
-        seed: of the estimator's random numbers.
-        starts: runs of the estimator, of which the best-supported model is kept, and which end as soon as two poses
-            agree, the network's among them; None = those that suit the method.
-        refine: finish with least squares on the pose, from these models and from the dominant plane's.
-        refine_threshold_px: where refinement and support cut the error off, pixels.
-    """
-
-    method: str = FilterOptions.method
-    threshold_px: float = 0.5
-    confidence: float = FilterOptions.confidence
-    max_iterations: int = FilterOptions.max_iterations
-    seed: int = FilterOptions.seed
-    starts: tuple[Start, ...] | None = None
-    refine: bool = True
-    refine_threshold_px: float = 1.0
-
-    @classmethod
-    def of(cls, options: FilterOptions) -> RobustFitOptions:
-        """What the filter's options ask of the fit."""
-        return cls(
-            method=options.method,
-            confidence=options.confidence,
-            max_iterations=options.max_iterations,
-            seed=options.seed,
-        )
-
-    @property
-    def runs(self) -> tuple[Start, ...]:
-        """The starts, or those that suit the method."""
-        if self.starts is not None:
-            return self.starts
-        return POSELIB_STARTS if self.method == "poselib" else STARTS
-
-    def estimator(self, index: int) -> EstimatorOptions:
-        """What start number ``index`` tells the estimator; each draws other samples."""
-        threshold_px = self.runs[index].threshold_factor * self.threshold_px
-        return EstimatorOptions(self.method, threshold_px, self.confidence, self.max_iterations, self.seed + index)
+PLAN = Plan()
 
 
 @dataclass(frozen=True)
@@ -116,7 +94,10 @@ class TwoViewModel:
         M: (3, 3) of unit Frobenius norm, ``x2^T M x1 = 0``: the essential matrix, or, with guessed intrinsics,
             the fundamental matrix expressed in normalised coordinates.
         E: (3, 3) essential matrix of unit Frobenius norm. R: (3, 3) rotation. t: (3,) unit norm.
-        origin: where it was found: ``"network"``, ``"start 1"``, ``"start 2"``, … or ``"plane"``.
+        origin: name of the source that proposed it.
+        ended: ``"before the network"``, ``"first sources"`` or ``"all sources"``.
+        confidence: probability that the pose is within 10 degrees; None with guessed intrinsics.
+        judgement: the measurements behind the choice; None likewise.
     """
 
     M: Array
@@ -124,159 +105,260 @@ class TwoViewModel:
     R: Array
     t: Array
     origin: str
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """The matrix M (3, 3) that the network or a start found, the matches (K, 4) to refine it on, and its name."""
-
-    M: Array
-    seen: Array
-    origin: str
+    ended: str
+    confidence: float | None = None
+    judgement: Judgement | None = None
 
 
 @dataclass(frozen=True)
 class _Pose:
-    """A pose, where it was found and how well it is supported."""
+    """A refined hypothesis."""
 
     R: Array
     t: Array
+    family: Family
     origin: str
-    support: float
 
 
-def estimate_model(
-    matches: RankedMatches,
-    focal_px: float,
-    options: RobustFitOptions = RobustFitOptions(),
-    calibrated: bool = True,
-    network_essential: NDArray[np.floating[Any]] | None = None,
-) -> TwoViewModel | None:
-    """Fit the two-view model to ranked matches.
+class Search:
+    """Hypotheses of a pair as they come, refined, and the choice among them.
 
     Args:
-        matches: what may be fitted to.
-        focal_px: mean focal length, pixels: converts the thresholds.
-        options: method, thresholds, starts, seed.
-        calibrated: the intrinsics can be trusted: estimate E with five points; else F with seven.
-        network_essential: (3, 3) of any scale, the network's own E, which stands first among what the starts find; one
-            that is not finite, and any with guessed intrinsics, is passed over.
-
-    Returns:
-        The model, or None where the matches are too few or the estimator finds nothing. Never raises for data.
-
-    Raises:
-        ImportError: ``method="poselib"`` without PoseLib.
+        evidence: what is known before the network.
+        coefficients: of the choice, from the model file.
+        options: method, confidence, largest number of iterations and seed count here.
+        plan: which sources propose, and when.
     """
-    if len(matches.correspondences) < MIN_MATCHES:
-        return None
-    fits = _fits(matches, focal_px, options, calibrated)
-    if calibrated:
-        return _best_calibrated(matches, chain(_proposed(matches, network_essential), fits), focal_px, options)
-    return _best_uncalibrated(matches, fits, focal_px, options)
+
+    def __init__(
+        self, evidence: Evidence, coefficients: Coefficients, options: FilterOptions, plan: Plan = PLAN
+    ) -> None:
+        self._coefficients, self._options, self._plan = coefficients, options, plan
+        self._poses: list[_Pose] = []
+        self._twins_of: _Pose | None = None
+        self._judgement: Judgement | None = None
+        self._take(evidence)
+
+    def before_network(self) -> TwoViewModel | None:
+        """The model of a list that explains itself; None where the network is wanted."""
+        if len(self._evidence) < MIN_MATCHES or not self._evidence.calibrated:
+            return None
+        for proposal in self._plan.before:
+            self._propose((proposal,))
+            share = self._explained()
+            if share < PROMISING:
+                return None
+            if share > CERTAIN:
+                break
+        self._propose_twins()
+        model = self._chosen("before the network")
+        judgement = None if model is None else model.judgement
+        return model if judgement is not None and choice.explains_list(judgement, self._coefficients) else None
+
+    def with_network(self, evidence: Evidence) -> TwoViewModel | None:
+        """The model by all sources, on scored matches; None where nothing is found."""
+        self._take(evidence)
+        if len(evidence) < MIN_MATCHES:
+            return None
+        if not evidence.calibrated:
+            return self._fundamental()
+        alone = ALONE.get(self._options.method)
+        if alone is not None:
+            self._poses = []
+            self._propose((alone,))
+            return self._chosen("all sources")
+        self._propose(self._plan.first)
+        ended = "first sources"
+        poselib = self._options.method == "poselib"
+        if poselib or not self._settled():
+            ended = "all sources"
+            if self._poses:
+                self._propose_twins()
+            known = {pose.origin for pose in self._poses}
+            self._propose([proposal for proposal in self._plan.second if proposal.name not in known])
+            self._propose((POSELIB,) if poselib else ())
+        if self._poses:
+            self._propose_twins()
+        return self._chosen(ended)
+
+    def _take(self, evidence: Evidence) -> None:
+        self._evidence, self._judgement = evidence, None
+        fitted = evidence.listed
+        if evidence.scores is not None:
+            fitted = fitted | (evidence.scores > ACCEPTED_SCORE)
+        enough = np.count_nonzero(fitted) >= MIN_MATCHES
+        self._fitted = evidence.correspondences[fitted] if enough else evidence.correspondences
+
+    def _run(self, proposal: Proposal) -> list[Array]:
+        """What a source proposes."""
+        options = self._options
+        iterations = min(proposal.iterations, options.max_iterations)
+        seed = options.seed + proposal.number
+        run = EstimatorOptions(proposal.method, proposal.threshold_px, options.confidence, iterations, seed)
+        return proposal.source(self._evidence, run)
+
+    def _propose(self, proposals: Sequence[Proposal]) -> None:
+        for proposal in proposals:
+            for E in self._run(proposal):
+                pose = pose_from_essential(E, self._fitted, self._evidence.focal_px)
+                if pose is not None:
+                    self._add(_Pose(*pose, proposal.family, proposal.name))
+
+    def _propose_twins(self) -> None:
+        """Under a dominant plane every pose has a twin that explains it as well: let both be judged."""
+        if not self._plan.twins:
+            return
+        best = self._poses[self._judge().chosen]
+        if self._twins_of is not None and _angle_deg(self._twins_of, best) < TWIN_DEG:
+            return
+        self._twins_of = best
+        for E in sources.plane(self._evidence, best.R, best.t, self._options.seed):
+            pose = pose_from_essential(E, self._fitted, self._evidence.focal_px)
+            if pose is not None:
+                twin = _Pose(*pose, Family.PLANE, "plane")
+                new = all(_angle_deg(twin, other) > TWIN_DEG for other in self._poses)
+                if new and self._near(twin) > TWIN_SHARE * self._near(best):
+                    self._add(twin)
+
+    def _add(self, found: _Pose) -> None:
+        """Refine what was found; what was found before is there refined."""
+        for other in self._poses:
+            if _angle_deg(found, other) < SAME_DEG:
+                R, t = other.R, other.t
+                break
+        else:
+            R, t = refine_pose(self._fitted, found.R, found.t, REFINE_PX / self._evidence.focal_px)
+        self._poses.append(_Pose(R, t, found.family, found.origin))
+        self._judgement = None
+
+    def _near(self, pose: _Pose) -> int:
+        """Number of matches within two pixels of a pose and in front of it."""
+        residuals = choice.measure_residuals(self._fitted, pose.R[None], pose.t[None], self._evidence.focal_px)
+        return int(np.count_nonzero((residuals.distance_px < 2.0) & ~residuals.behind))
+
+    def _explained(self) -> float:
+        """Share of the matches that the best of what was found explains."""
+        return float(np.exp(self._judge().features["log share"])) if self._poses else 0.0
+
+    def _settled(self) -> bool:
+        """True where nothing more needs to be tried: unlike sources agree, or hope is lost.
+
+        ``coefficients["settled"]``: number of other families that agree, confidence above which their agreement is
+        enough, confidence below which more of the same has never helped.
+        """
+        if not self._poses or not self._plan.settle:
+            return False
+        families, certain, hopeless = self._coefficients["settled"]
+        judgement = self._judge()
+        confidence = choice.confidence(judgement, self._coefficients)
+        agreed = judgement.features["other families within 2 deg"] >= families and confidence > certain
+        return agreed or confidence < hopeless
+
+    def _judge(self) -> Judgement:
+        """Measure all hypotheses and choose; once as long as none is added."""
+        if self._judgement is None:
+            evidence = self._evidence
+            hypotheses = Hypotheses(
+                np.stack([pose.R for pose in self._poses]),
+                np.stack([pose.t for pose in self._poses]),
+                np.array([int(pose.family) for pose in self._poses]),
+            )
+            self._judgement = choice.judge(
+                evidence.correspondences,
+                evidence.scores,
+                hypotheses,
+                evidence.focal_px,
+                _poses_of_network(evidence),
+                self._coefficients,
+            )
+        return self._judgement
+
+    def _chosen(self, ended: str) -> TwoViewModel | None:
+        """The best of what was found so far, whatever it is worth; None where nothing was."""
+        if not self._poses:
+            return None
+        judgement = self._judge()
+        rate = choice.early_confidence if self._evidence.scores is None else choice.confidence
+        pose = self._poses[judgement.chosen]
+        E = essential_from_pose(pose.R, pose.t)
+        confidence = rate(judgement, self._coefficients)
+        return TwoViewModel(E, E, pose.R, pose.t, pose.origin, ended, confidence, judgement)
+
+    def _fundamental(self) -> TwoViewModel | None:
+        """The fundamental matrix of a pair without intrinsics, and the pose that the guessed ones make of it.
+
+        The same sources with F estimators. The choice is the likelihood alone: without intrinsics depths mean little.
+        """
+        evidence, method = self._evidence, self._options.method
+        wanted = (ALONE[method],) if method in ALONE else (BEFORE_NETWORK[0], *FIRST[1:], *SECOND[1:3])
+        if method == "poselib":
+            wanted = (*wanted, POSELIB)
+        found = [(F, proposal.name) for proposal in wanted for F in self._run(proposal)]
+        if not found:
+            return None
+        distance = np.stack([sampson_distance(evidence.correspondences, F) for F, _ in found]) * evidence.focal_px
+        probability = choice.prior(np.asarray(evidence.scores), self._coefficients)
+        residuals = Residuals(distance, np.zeros(distance.shape, dtype=bool))
+        likelihood = choice.log_likelihoods(residuals, probability, self._coefficients)
+        F, origin = found[int(np.argmax(likelihood[:, int(np.argmax(likelihood.max(axis=0)))]))]
+        E = project_to_essential(F)
+        pose = pose_from_essential(F, evidence.correspondences, evidence.focal_px)
+        return None if pose is None else TwoViewModel(F, E, *pose, origin, "all sources")
 
 
-def _proposed(matches: RankedMatches, network_essential: NDArray[np.floating[Any]] | None) -> Iterator[_Fit]:
-    """What the network proposes, to be refined on the matches that it accepts."""
-    if network_essential is not None and np.isfinite(network_essential).all():
-        yield _Fit(network_essential.astype(np.float64), matches.above(0.0).correspondences, "network")
+def scores_by_residuals(pair: PairInput, model: TwoViewModel, coefficients: Coefficients) -> NDArray[np.float32]:
+    """Scores (M,) of a pair that ended before the network, from the residuals of its matches to the model."""
+    valid, listed = pair.valid, listed_rows(pair.attributes, pair.valid)
+    scores = np.zeros(len(valid), dtype=np.float32)
+    residuals = choice.measure_residuals(pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px)
+    scale = 1.0 if model.judgement is None else model.judgement.scale
+    groups = (listed[valid], ~listed[valid])
+    scores[valid] = choice.posterior(residuals, groups, scale, coefficients)
+    return scores
 
 
-def _fits(matches: RankedMatches, focal_px: float, options: RobustFitOptions, calibrated: bool) -> Iterator[_Fit]:
-    """What the starts find, one after the other."""
-    for index, start in enumerate(options.runs):
-        seen = matches.above(start.margin).correspondences
-        M = fit_epipolar(seen, focal_px, options.estimator(index), calibrated)
-        if M is not None:
-            yield _Fit(M, seen, f"start {index + 1}")
+def fit_alone(evidence: Evidence, method: str, threshold_px: float, options: FilterOptions) -> TwoViewModel | None:
+    """One robust estimator on the list as it is, unrefined: what a classical pipeline does.
 
-
-def _best_calibrated(
-    matches: RankedMatches, fits: Iterable[_Fit], focal_px: float, options: RobustFitOptions
-) -> TwoViewModel | None:
-    """The best-supported pose among the refined fits and the plane's rivals of the best of them."""
-    threshold = options.refine_threshold_px / focal_px
-    poses: list[_Pose] = []
-    for fit in fits:
-        pose = pose_from_essential(project_to_essential(fit.M), fit.seen[sampson_distance(fit.seen, fit.M) < threshold])
-        if pose is None:
-            continue
-        R, t = refine_pose(fit.seen, *pose, threshold) if options.refine else pose
-        poses.append(_Pose(R, t, fit.origin, matches.pose_support(R, t, threshold)))
-        if _agree(poses):
-            break
-    if not poses:
-        return None
-    best = max(poses, key=lambda pose: pose.support)
-    if options.refine:
-        rivals = _plane_rivals(matches, best, threshold, options.seed)
-        best = max([best, *rivals], key=lambda pose: pose.support)
-    E = essential_from_pose(best.R, best.t)
-    return TwoViewModel(M=E, E=E, R=best.R, t=best.t, origin=best.origin)
-
-
-def _agree(poses: Sequence[_Pose]) -> bool:
-    """True where the best-supported pose has been found twice."""
-    best = max(poses, key=lambda pose: pose.support)
-    return any(
-        other is not best
-        and other.support > AGREEMENT_SUPPORT_SHARE * best.support
-        and pose_error_deg(other.R, other.t, best.R, best.t) < AGREEMENT_DEG
-        for other in poses
-    )
-
-
-def _best_uncalibrated(
-    matches: RankedMatches, fits: Iterable[_Fit], focal_px: float, options: RobustFitOptions
-) -> TwoViewModel | None:
-    """The best-supported fundamental matrix, and the pose that the guessed intrinsics make of it."""
-    threshold = options.refine_threshold_px / focal_px
-    best = max(fits, key=lambda fit: matches.support(fit.M, threshold), default=None)
-    if best is None:
-        return None
-    E = project_to_essential(best.M)
-    pose = pose_from_essential(E, best.seen[sampson_distance(best.seen, best.M) < threshold])
-    return None if pose is None else TwoViewModel(best.M, E, *pose, origin=best.origin)
-
-
-def _plane_rivals(matches: RankedMatches, best: _Pose, threshold: float, seed: int) -> list[_Pose]:
-    """Refined poses that the dominant plane of a pose's inliers allows.
-
-    Where most matches lie on one plane two poses explain them about equally well, and sampling meets one of them
-    by chance. The few matches off the plane, and the depths, tell which is right.
+    Args:
+        evidence: the list. method: as in :class:`EstimatorOptions`. threshold_px: of an inlier, pixels.
+        options: confidence, largest number of iterations and seed count here.
     """
-    accepted = matches.above(0.0).correspondences
-    near = accepted[sampson_distance(accepted, essential_from_pose(best.R, best.t)) < threshold]
-    H = fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, seed)
-    rivals = []
-    for start in [] if H is None else poses_from_homography(H):
-        if matches.pose_support(*start, threshold) > RIVAL_SUPPORT_SHARE * best.support:
-            R, t = refine_pose(accepted, *start, threshold)
-            rivals.append(_Pose(R, t, "plane", matches.pose_support(R, t, threshold)))
-    return rivals
+    run = EstimatorOptions(method, threshold_px, options.confidence, options.max_iterations, options.seed)
+    found = sources.listed(evidence, run)
+    if not found:
+        return None
+    M = found[0]
+    pose = pose_from_essential(M, evidence.correspondences, evidence.focal_px)
+    return None if pose is None else TwoViewModel(M, project_to_essential(M), *pose, method, "all sources")
 
 
-def estimate_pose(
-    matches: RankedMatches,
-    focal_px: float,
-    options: RobustFitOptions = RobustFitOptions(),
-    network_essential: NDArray[np.floating[Any]] | None = None,
-) -> tuple[Array, Array] | None:
-    """Relative pose R (3, 3), t (3,) of calibrated images, or None; arguments as in :func:`estimate_model`."""
-    model = estimate_model(matches, focal_px, options, network_essential=network_essential)
-    return None if model is None else (model.R, model.t)
-
-
-def pose_from_essential(E: Array, correspondences: Array) -> tuple[Array, Array] | None:
-    """The pose of an essential matrix (3, 3) that puts most of the matches (N, 4) in front of both cameras.
+def pose_from_essential(E: Array, correspondences: Array, focal_px: float) -> tuple[Array, Array] | None:
+    """The pose of an essential matrix (3, 3) that puts most of the matches (N, 4) near it in front of both cameras.
 
     However far they are: ``cv2.recoverPose``, which takes five times as long, drops what is beyond its limit.
     """
-    if len(correspondences) == 0 or not np.isfinite(E).all():
+    if not np.isfinite(E).all() or not np.any(E):
         return None
+    near = correspondences[sampson_distance(correspondences, E) < REFINE_PX / focal_px]
+    if len(near) == 0:
+        return None
+    poses = decompose_essential(project_to_essential(E))
+    R, t = np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
+    behind = choice.measure_residuals(near, R, t, focal_px).behind
+    return poses[int(np.argmin(behind.sum(axis=1)))]
 
-    def in_front(pose: tuple[Array, Array]) -> int:
-        depth1, depth2 = triangulated_depths(correspondences, *pose)
-        return int(np.count_nonzero((depth1 > 0) & (depth2 > 0)))
 
-    return max(decompose_essential(E), key=in_front)
+def _poses_of_network(evidence: Evidence) -> tuple[Array, Array] | None:
+    """R (4, 3, 3), t (4, 3): the poses that the network E allows, or None."""
+    E = evidence.network_essential
+    if E is None or not np.isfinite(E).all() or not np.any(E):
+        return None
+    R, t = zip(*decompose_essential(project_to_essential(E)))
+    return np.stack(R), np.stack(t)
+
+
+def _angle_deg(a: _Pose, b: _Pose) -> float:
+    """Larger of the angles of rotation and of direction (sign ignored) between two poses."""
+    cosine = min(0.5 * (float(np.vdot(a.R, b.R)) - 1.0), abs(float(a.t @ b.t)))
+    return degrees(acos(max(-1.0, min(1.0, cosine))))

@@ -35,6 +35,11 @@ class Calibration:
         with np.errstate(under="ignore"):
             return sigmoid(self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
 
+    def logits(self, probabilities: ArrayLike) -> NDArray[np.float32]:
+        """The logits (N,) float32 that probabilities (N,) come from; 0 and 1 give those of 1e-9 below and above."""
+        p = np.clip(np.asarray(probabilities, dtype=np.float64), 1e-9, 1.0 - 1e-9)
+        return ((np.log(p) - np.log1p(-p) - self.offset) / self.scale).astype(np.float32)
+
 
 def largest_set_of_precision(scores: NDArray[np.float32], precision: float) -> NDArray[np.bool_]:
     """The most matches (N,) bool, best scores first, whose mean score is at least ``precision``.

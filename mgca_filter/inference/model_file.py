@@ -20,10 +20,11 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
+from ..fit.choice import check_coefficients
 from ..inputs.attributes import ATTRIBUTE_COUNT
 from .calibration import AttributePrior, Calibration
 
-CONTRACT_VERSION = "1"
+CONTRACT_VERSION = "2"
 # The largest preset takes 20 MB; more than this is another file, and is not read into memory.
 MAX_MODEL_BYTES = 2**29
 SUMS_NAME = "SHA256SUMS"
@@ -47,6 +48,7 @@ METADATA_KEYS = (
     "decision_threshold",
     "candidate_rule",
     "prior",
+    "choice",
 )
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
@@ -70,6 +72,7 @@ class ModelMetadata:
         decision_threshold: a match above this logit counts as accepted.
         candidate_max_ratio, candidate_min_count: which matches enter the network (``candidate_mask``).
         prior: scores of the matches that do not.
+        choice: coefficients of the choice among hypotheses and of its confidence (``fit/choice.py``).
         sha256: of the model file, hexadecimal.
     """
 
@@ -87,6 +90,7 @@ class ModelMetadata:
     candidate_max_ratio: float
     candidate_min_count: int
     prior: AttributePrior
+    choice: dict[str, list[float]]
     sha256: str
 
 
@@ -181,6 +185,8 @@ def _parse_metadata(properties: Mapping[str, str], sha256: str, path: Path) -> M
         max_ratio, min_count = _finite(rule["max_ratio"]), int(rule["min_count"])
         key = "prior"
         prior = _parse_prior(json.loads(properties[key]))
+        key = "choice"
+        choice = check_coefficients(json.loads(properties[key]))
     except (ValueError, TypeError, KeyError) as error:
         raise ModelError(f"{path}: metadata '{key}' cannot be read ({type(error).__name__}: {error})") from error
     return ModelMetadata(
@@ -191,6 +197,7 @@ def _parse_metadata(properties: Mapping[str, str], sha256: str, path: Path) -> M
         candidate_max_ratio=max_ratio,
         candidate_min_count=min_count,
         prior=prior,
+        choice=choice,
         sha256=sha256,
     )
 

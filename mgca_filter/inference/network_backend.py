@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..errors import BackendError
+from ..fit.choice import fitted_coefficients
 from ..inputs.attributes import ATTRIBUTE_COUNT, CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from ..network import MGCANet
 from . import ModelMetadata
@@ -72,4 +73,5 @@ def network_metadata(network: MGCANet) -> ModelMetadata:
         candidate_max_ratio=CANDIDATE_MAX_RATIO,
         candidate_min_count=CANDIDATE_MIN_COUNT,
         prior=prior,
+        choice=fitted_coefficients(),
     )

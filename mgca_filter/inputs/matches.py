@@ -26,6 +26,7 @@ class PutativeMatches:
         index1, index2: (M,) rows of the keypoints; −1 in both where the caller's row holds no match at all
             (``knnMatch`` writes such rows).
         ratio: (M,) float32 ratio of the two best distances, NaN where a row has no second candidate, or None.
+        distance: (M,) float64 descriptor distance, NaN where it was not set, or None.
         best: (M,) bool, no other row reaches the same keypoint of image 2 at a smaller distance, or None.
         source: what the caller passed, for :meth:`select`.
     """
@@ -35,6 +36,7 @@ class PutativeMatches:
     ratio: NDArray[np.float32] | None
     best: NDArray[np.bool_] | None
     source: Any
+    distance: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.index1)
@@ -113,7 +115,7 @@ def _from_dmatch(source: Any, rows: Sequence[Any], count1: int, count2: int, nam
     _check_range(index1[present], index2[present], count1, count2, name)
     distance1, distance2 = (np.where(np.abs(d) < _NO_DISTANCE, d, np.nan) for d in (distance1, distance2))
     ratio = None if np.isnan(distance2).all() else distance_ratio(distance1, distance2)
-    return PutativeMatches(index1, index2, ratio, best_of_list(index2, distance1), source)
+    return PutativeMatches(index1, index2, ratio, best_of_list(index2, distance1), source, distance1)
 
 
 def _field(matches: Sequence[Any], name: str) -> NDArray[np.float64]:

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..types import Providers
 
-METHODS = ("prosac", "magsac", "ransac", "poselib", "none")
+METHODS = ("auto", "poselib", "prosac", "magsac", "ransac", "none")
+EFFORTS = ("auto", "full")
 # OpenCV's flags of the estimators that have the same names here.
 _FLAGS = {cv2.USAC_MAGSAC: "magsac", cv2.USAC_PROSAC: "prosac", cv2.RANSAC: "ransac"}
 
@@ -25,6 +26,7 @@ class FilterOptions:
         keep_precision: expected precision of the mask that takes the threshold's place, or None.
         confidence: of the robust fit, between 0 and 1.
         method: one of :data:`METHODS`.
+        effort: one of :data:`EFFORTS`.
         max_iterations: largest number of samples that one run of a robust estimator draws.
         seed: of every random choice.
 
@@ -35,7 +37,8 @@ class FilterOptions:
     threshold: float = 1.0
     keep_precision: float | None = None
     confidence: float = 0.999
-    method: str = "prosac"
+    method: str = "auto"
+    effort: str = "auto"
     max_iterations: int = 5000
     seed: int = 0
 
@@ -45,6 +48,7 @@ class FilterOptions:
             check_number(self.keep_precision, "keep_precision", 0.0, 1.0)
         check_number(self.confidence, "confidence", 0.0, 1.0)
         check_choice(self.method, METHODS, "method")
+        check_choice(self.effort, EFFORTS, "effort")
         check_integer(self.max_iterations, "max_iterations", 1)
         check_integer(self.seed, "seed", 0)
 

@@ -54,6 +54,8 @@ class PairInput:
         correspondences: (M, 4) float64, normalised; NaN where a row has no usable coordinates.
         valid: (M,) bool, rows with usable coordinates.
         attributes: (M, 8) float32, encoded.
+        order: (M,) float64, ascending = promising: the ratio where it is known, else the descriptor distance; NaN where
+            neither is.
         intrinsics1, intrinsics2: cameras, given or guessed, in pixels.
         unit_px: pixels to a unit of the caller's coordinates: 1, or where these are normalised or millimetres, the
             number that makes pixels of them.
@@ -67,6 +69,7 @@ class PairInput:
     correspondences: NDArray[np.float64]
     valid: NDArray[np.bool_]
     attributes: NDArray[np.float32]
+    order: NDArray[np.float64]
     intrinsics1: Intrinsics
     intrinsics2: Intrinsics
     unit_px: float = 1.0
@@ -163,12 +166,20 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         correspondences,
         valid,
         known.encode(len(putative)),
+        _order(known, putative),
         intrinsics1,
         intrinsics2,
         unit_px,
         _LARGEST_THRESHOLD_SHARE * yardstick if unit_px != 1.0 else float("inf"),
         tuple(assumptions),
     )
+
+
+def _order(known: MatchAttributes, matches: PutativeMatches) -> NDArray[np.float64]:
+    """What tells promising matches (M,) from others without a network, ascending; NaN where nothing does."""
+    if known.ratio is not None and np.isfinite(known.ratio).any():
+        return np.asarray(known.ratio, dtype=np.float64)
+    return np.full(len(matches), np.nan) if matches.distance is None else matches.distance
 
 
 def _check_shared_camera(pair: MatchPair) -> None:

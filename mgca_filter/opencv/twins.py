@@ -6,14 +6,15 @@ What OpenCV's arguments mean here, for :func:`findEssentialMat` and :func:`findF
   ratios, keypoint sizes and angles before the call has lost them by then: :func:`mgca_filter.filter_matches` takes the
   keypoints and matches themselves and does markedly better. Points in units of the focal length (``cameraMatrix`` the
   identity, threshold 1e-3) are recognised by their size.
-- *method*: ``cv2.USAC_MAGSAC`` scores samples by MAGSAC; every other robust method gives the filter's default.
-  ``cv2.FM_7POINT`` and ``cv2.FM_8POINT`` ask for a solver, not for a filter: they go to OpenCV as they are.
+- *method*: every robust method gives the filter's own fit, which asks MAGSAC and PROSAC among others and takes the most
+  likely answer. ``cv2.FM_7POINT`` and ``cv2.FM_8POINT`` ask for a solver, not for a filter: they go to OpenCV as they
+  are.
 - *prob*, *confidence*: probability that the robust fit has drawn a sample without outliers. *maxIters*: its samples.
 - *threshold*, *ransacReprojThreshold*: Sampson distance, pixels, up to which the mask calls a match an inlier. The fit
   itself works at a threshold of its own.
 - *mask*: an output, as in OpenCV: an array uint8 (N, 1) passed in is written to; what it holds is not read.
-- *UsacParams*: ``confidence``, ``threshold``, ``maxIterations`` and ``randomGeneratorState`` as above, ``score``
-  chooses MAGSAC; the rest is not used.
+- *UsacParams*: ``confidence``, ``threshold``, ``maxIterations`` and ``randomGeneratorState`` as above; the rest is not
+  used.
 
 What comes back: a matrix (3, 3) float64, never several stacked, and always a mask (N, 1) of 0 and 1, uint8. A script
 that hands the matrix on, to ``cv2.recoverPose`` say, gets one wherever OpenCV would have given one: where the filter
@@ -147,7 +148,7 @@ def _essential_of_one_camera(
     maxIters: int = 1000,
     mask: Any = None,
 ) -> Answer:
-    fit = _read_fit(method, prob, threshold, maxIters)
+    fit = _read_fit(prob, threshold, maxIters)
     return _fit_essential(points1, points2, cameraMatrix, cameraMatrix, None, None, fit, mask)
 
 
@@ -163,7 +164,7 @@ def _essential_of_focal_length(
     mask: Any = None,
 ) -> Answer:
     K = np.array([[focal, 0.0, pp[0]], [0.0, focal, pp[1]], [0.0, 0.0, 1.0]])
-    return _fit_essential(points1, points2, K, K, None, None, _read_fit(method, prob, threshold, maxIters), mask)
+    return _fit_essential(points1, points2, K, K, None, None, _read_fit(prob, threshold, maxIters), mask)
 
 
 def _essential_of_two_cameras(
@@ -178,7 +179,7 @@ def _essential_of_two_cameras(
     threshold: float = 1.0,
     mask: Any = None,
 ) -> Answer:
-    fit = _read_fit(method, prob, threshold, 1000)
+    fit = _read_fit(prob, threshold, 1000)
     return _fit_essential(points1, points2, cameraMatrix1, cameraMatrix2, distCoeffs1, distCoeffs2, fit, mask)
 
 
@@ -220,14 +221,14 @@ def _fundamental_with_limit(
         return _solve_fundamental(points1, points2, method, mask)
     threshold = ransacReprojThreshold if ransacReprojThreshold > 0 else 3.0
     confidence = confidence if 0.0 < confidence < 1.0 else 0.99
-    return _fit_fundamental(points1, points2, _read_fit(method, confidence, threshold, maxIters), mask)
+    return _fit_fundamental(points1, points2, _read_fit(confidence, threshold, maxIters), mask)
 
 
 def _fundamental_by_params(points1: Any, points2: Any, params: cv2.UsacParams, mask: Any = None) -> Answer:
     return _fit_fundamental(points1, points2, _read_params(params), mask)
 
 
-def _read_fit(method: int, confidence: float, threshold: float, max_iterations: int, seed: int = 0) -> FilterOptions:
+def _read_fit(confidence: float, threshold: float, max_iterations: int, seed: int = 0) -> FilterOptions:
     """Options of the filter from OpenCV's scalar arguments; the threshold stays in the unit of the points.
 
     Raises:
@@ -236,7 +237,6 @@ def _read_fit(method: int, confidence: float, threshold: float, max_iterations: 
     return FilterOptions(
         threshold=check_number(threshold, "threshold", 0.0, float("inf")),
         confidence=check_number(confidence, "prob", 0.0, 1.0),
-        method="magsac" if method == cv2.USAC_MAGSAC else FilterOptions.method,
         max_iterations=check_integer(max_iterations, "maxIters", 1),
         seed=seed,
     )
@@ -244,9 +244,8 @@ def _read_fit(method: int, confidence: float, threshold: float, max_iterations: 
 
 def _read_params(params: cv2.UsacParams) -> FilterOptions:
     """The same from ``cv2.UsacParams``; errors as :func:`_read_fit`."""
-    method = cv2.USAC_MAGSAC if params.score == cv2.SCORE_METHOD_MAGSAC else cv2.RANSAC
     seed = abs(int(params.randomGeneratorState))
-    return _read_fit(method, params.confidence, params.threshold, params.maxIterations, seed)
+    return _read_fit(params.confidence, params.threshold, params.maxIterations, seed)
 
 
 def _fit_essential(

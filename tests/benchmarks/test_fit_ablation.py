@@ -1,4 +1,4 @@
-"""The study of the robust fit's steps: its first row is what users get, and each other row changes something."""
+"""The study of the robust fit's pieces: its first row is what users get, and each other row changes something."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from conftest import make_scene
 from scene_bundles import write_bundle
 
-from benchmarks.fit_ablation import AS_IT_IS, VARIANTS, ScoredPair, Variant, format_study, main
+from benchmarks.fit_ablation import AS_IT_IS, VARIANTS, ScoredPair, Variant, format_study, main, origin_table
 from mgca_filter import MatchFilter
 from mgca_filter.evaluation.our_rows import filter_pair
 from mgca_filter.evaluation.pairs import select_pairs
@@ -19,19 +19,25 @@ from mgca_filter.geometry.epipolar import pose_error_deg
 @pytest.fixture
 def scored(tmp_path: Path, model_file: Path) -> ScoredPair:
     write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
-    return ScoredPair.of(select_pairs(tmp_path)[0].source[0], str(model_file))
+    return ScoredPair.of(select_pairs(tmp_path)[0].source[0], MatchFilter(model=model_file, effort="full"))
 
 
-def test_the_fit_as_it_is_is_what_the_filter_does(scored: ScoredPair, model_file: Path) -> None:
+@pytest.mark.parametrize(("variant", "options"), [(AS_IT_IS, {}), ("no end before the network", {"effort": "full"})])
+def test_the_fit_as_it_is_is_what_the_filter_does(
+    scored: ScoredPair, model_file: Path, variant: str, options: dict[str, str]
+) -> None:
     pair = scored.pair
-    result = filter_pair(pair, np.arange(len(pair.points1)), str(model_file), {})
-    options = MatchFilter(model=model_file).fit_options
-    expected = pose_error_deg(result.R, result.t, pair.R, pair.t)
-    assert scored.error_deg(VARIANTS[AS_IT_IS], options) == expected
+    result = filter_pair(pair, np.arange(len(pair.points1)), str(model_file), options)
+    model = scored.fit(VARIANTS[variant])
+    assert model is not None
+    np.testing.assert_array_equal(model.R, result.R)
+    assert scored.error_deg(model) == pose_error_deg(result.R, result.t, pair.R, pair.t)
+    assert model.ended == result.info["ended"]
 
 
 def test_every_variant_but_the_first_changes_something() -> None:
-    assert [name for name, variant in VARIANTS.items() if variant == Variant({})] == [AS_IT_IS]
+    assert [name for name, variant in VARIANTS.items() if variant == Variant()] == [AS_IT_IS]
+    assert len({repr(variant) for variant in VARIANTS.values()}) == len(VARIANTS)
 
 
 def test_the_table_has_means_and_differences() -> None:
@@ -44,10 +50,19 @@ def test_the_table_has_means_and_differences() -> None:
     assert second.startswith("| worse | 75.0 | 75.0 | 62.5 | -25.0 [-50.0, +0.0] | -17.5 [")
 
 
+def test_origins_are_counted(scored: ScoredPair) -> None:
+    model = scored.fit(VARIANTS[AS_IT_IS])
+    rows = origin_table([model, model, model, None], [1.0, 2.0, 30.0, 180.0]).splitlines()[2:]
+    assert rows[0].endswith("| 75 % | 67 % |")
+    assert rows[1] == "| none | 25 % | 0 % |"
+
+
 def test_command(tmp_path: Path, model_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("poselib")
     write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
     assert main([str(tmp_path / "hall.npz"), "--model", str(model_file), "--seeds", "0", "1"]) == 0
-    assert capsys.readouterr().out.count("\n| ") == len(VARIANTS) + 1
+    study, origins = capsys.readouterr().out.split("\n\n")
+    assert study.count("\n| ") == len(VARIANTS)
+    assert "100 %" in origins
     assert main([str(tmp_path / "missing.npz")]) == 2
     assert "missing.npz" in capsys.readouterr().err

@@ -10,10 +10,8 @@ from conftest import make_scene
 from scene_bundles import write_bundle
 
 from benchmarks import prefiltered_pairs
-from benchmarks.fit_ablation import RunOutcome, compare_runs, run_table
 from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
 from mgca_filter.evaluation.selection import Selection
-from mgca_filter.fit import robust_fit
 
 
 @pytest.fixture
@@ -57,33 +55,7 @@ def test_without_ratio_the_selection_has_it_and_the_filter_has_not(
     assert answer.R is not None
 
 
-def test_first_run_alone_calls_the_estimator_once(
-    bundles: Path, model_file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seeds = []
-    fit = robust_fit.fit_epipolar
-
-    def counted(rows, focal_px, options, calibrated):
-        seeds.append(options.seed)
-        return fit(rows, focal_px, options, calibrated)
-
-    monkeypatch.setattr(robust_fit, "fit_epipolar", counted)
-    outcomes = compare_runs([select_pairs(bundles)[0].source[0]], str(model_file))
-    assert seeds[-1] == 0
-    assert seeds.count(0) == 2
-    assert len(seeds) >= 3
-    assert outcomes[0].origin.startswith(("start", "plane"))
-    assert outcomes[0].error_deg < 2.0
-    assert outcomes[0].cpu_ms > 0.0
-
-
-def test_runs_are_counted() -> None:
-    rows = [RunOutcome("run 1", 1.0, 1.0, 20.0, 10.0)] * 3 + [RunOutcome("run 2", 1.0, 50.0, 20.0, 10.0)]
-    table = run_table({"all": rows})
-    assert table.splitlines()[2:] == ["| all | 4 | run 1 75 %, run 2 25 % | 100.0 | 75.0 | 50 % |"]
-
-
-def test_command_prints_three_tables_and_takes_known_results_from_the_store(
+def test_command_prints_two_tables_and_takes_known_results_from_the_store(
     bundles: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rendered = write_bundle(tmp_path / "rendered.npz", [make_scene(seed=7)])
@@ -93,13 +65,13 @@ def test_command_prints_three_tables_and_takes_known_results_from_the_store(
     tables = capsys.readouterr().out.split("\n\n")
     rows = [[line.split(" | ") for line in table.splitlines()[2:]] for table in tables]
     assert [row[0] for row in rows[0]] == ["| photographs, easy", "| rendered, easy", "| rendered, all"]
-    assert [row[1] for row in rows[0]] == [row[1] for row in rows[1]] == ["2", "1", "1"]
-    assert len(rows[2]) == 4 * len(prefiltered_pairs.TESTS)
-    assert {row[3] for row in rows[2]} == {"1"}
+    assert [row[1] for row in rows[0]] == ["2", "1", "1"]
+    assert len(rows[1]) == 4 * len(prefiltered_pairs.TESTS)
+    assert {row[3] for row in rows[1]} == {"1"}
     stored = {path: path.stat().st_mtime_ns for path in (tmp_path / "store").rglob("*.json")}
     assert prefiltered_pairs.main(arguments) == 0
     again = capsys.readouterr().out.split("\n\n")
-    assert [again[0], again[2].strip()] == [tables[0], tables[2].strip()]
+    assert [again[0], again[1].strip()] == [tables[0], tables[1].strip()]
     assert stored == {path: path.stat().st_mtime_ns for path in (tmp_path / "store").rglob("*.json")}
 
 

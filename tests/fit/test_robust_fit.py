@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from conftest import K, Scene, make_scene
+from mgca_filter.fit.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
 
 from mgca_filter.fit import robust_fit
 from mgca_filter.fit.estimators import fit_epipolar, fit_homography, usac_params
-from mgca_filter.fit.ranking import MIN_FIT_MATCHES, RankedMatches, match_order
 from mgca_filter.fit.robust_fit import (
     SINGLE_START,
     RobustFitOptions,

@@ -1,0 +1,357 @@
+"""Choice among hypotheses, and the confidence of what was chosen.
+
+The choice is the likelihood of the matches: each is right with a probability that its score gives, and then lies
+about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and anywhere.
+The confidence is a logistic regression on measurements of the chosen hypothesis: how much of the list it explains, how
+far the best *other* answer falls behind, which unlike sources found the same, how firmly its inliers hold it. All
+hypotheses are measured on all distinct matches in one vectorised pass. The numbers are data, a dict of lists of floats,
+fitted on training scenes (``choice.json``) and carried by every model file, from which Python and C++ read them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose_refinement import pose_uncertainty_deg
+
+Array = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Coefficients = Mapping[str, Sequence[float]]
+
+# The signs of depths say something only where the rays are this far from parallel, pixels.
+MIN_PARALLAX_PX = 1.5
+# Without scores the share of right matches is at least and at most this.
+MIN_SHARE, MAX_SHARE = 0.02, 0.8
+# Residuals between these, pixels, say how densely wrong matches lie around an epipolar line.
+BACKGROUND_PX = (6.0, 18.0)
+# Beyond this angle two hypotheses are rivals and not the same answer.
+RIVAL_DEG = 5.0
+AGREEMENT_DEG = (2.0, 5.0, 10.0)
+# Half a pixel is the noise of SIFT's keypoints, more than enough; scales of the likelihood multiply it.
+NOISE_PX = 0.5
+# Shares of right matches in a group, and rounds in which they are found.
+_LEAST_SHARE, _LARGEST_SHARE, _SHARE_ROUNDS = 1e-3, 0.99, 8
+# Gaps between log-likelihoods are compressed beyond this.
+GAP_UNIT = 3.0
+
+FEATURES = (
+    *("log count", "log weighted count", "log share", "log weighted share"),
+    *("log significance", "log weighted significance", "likelihood per inlier"),
+    *("likelihood to rival", "plain likelihood to rival", "support to rival"),
+    *("plain likelihood to best", "weighted support to best", "share behind"),
+    *("near network E 3 deg", "near network E 10 deg", "no network E"),
+    *(f"other families within {angle:g} deg" for angle in AGREEMENT_DEG),
+    *("log scale", "log matches", "log sum of scores", "log uncertainty deg"),
+)
+"""Measurements of the chosen hypothesis, in the order of ``coefficients["confidence"]``, which ends in the offset."""
+
+EARLY_FEATURES = (
+    "log count",
+    "log share",
+    "plain likelihood to rival",
+    "share behind",
+    "log uncertainty deg",
+    "log significance",
+)
+"""The same without a network, in the order of ``coefficients["early_confidence"]``."""
+
+
+# Coefficients by name, and how many numbers each has; of those of the mixture only that they are equally many.
+COEFFICIENTS = {
+    "score_trust": 3,
+    "noise_px": None,
+    "noise_weights": None,
+    "noise_scales": None,
+    "outlier_width_px": 1,
+    "seen_behind": 1,
+    "early_end": 5,
+    "settled": 3,
+    "verdict": 2,
+    "confidence": len(FEATURES) + 1,
+    "early_confidence": len(EARLY_FEATURES) + 1,
+}
+
+
+def fitted_coefficients() -> dict[str, list[float]]:
+    """The coefficients that were fitted last, for a network that has no model file yet."""
+    return check_coefficients(json.loads(Path(__file__).with_name("choice.json").read_text(encoding="utf-8")))
+
+
+def check_coefficients(values: Mapping[str, Sequence[float]]) -> dict[str, list[float]]:
+    """The coefficients, every list of the right length and of finite numbers.
+
+    Raises:
+        ValueError: one is missing, or has another length or values.
+    """
+    checked = {}
+    for name, count in COEFFICIENTS.items():
+        if name not in values:
+            raise ValueError(f"{name} is missing")
+        numbers = [float(value) for value in values[name]]
+        if not numbers or not np.isfinite(numbers).all() or (count is not None and len(numbers) != count):
+            raise ValueError(f"{name}: expected {count or 'some'} finite numbers, got {numbers}")
+        checked[name] = numbers
+    if len(checked["noise_px"]) != len(checked["noise_weights"]):
+        raise ValueError("noise_px and noise_weights differ in length")
+    return checked
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """Poses that lie before the choice, ``X2 = R X1 + t``.
+
+    Attributes:
+        R: (H, 3, 3). t: (H, 3) unit norm.
+        family: (H,) integers: hypotheses of one family come from like sources, and do not bear each other out.
+    """
+
+    R: Array
+    t: Array
+    family: NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Hypotheses on matches.
+
+    Attributes:
+        distance_px: (H, N) Sampson distances in pixels.
+        behind: (H, N) True where a match lies behind a camera and its rays are not nearly parallel.
+    """
+
+    distance_px: Array
+    behind: BoolArray
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The chosen hypothesis.
+
+    Attributes:
+        chosen: its position.
+        features: what is known of it, by the names of :data:`FEATURES`.
+        likelihood: (H,) log-likelihood ratios of all hypotheses.
+        distance_px: (N,) Sampson distances of the matches to it; infinite where a match lies behind a camera.
+        share: of right matches under it.
+        scale: of the noise, by which :data:`NOISE_PX` is multiplied.
+    """
+
+    chosen: int
+    features: Mapping[str, float]
+    likelihood: Array
+    distance_px: Array
+    share: float
+    scale: float
+
+
+def measure_residuals(correspondences: Array, R: Array, t: Array, focal_px: float) -> Residuals:
+    """Residuals of poses R (H, 3, 3), t (H, 3) on matches (N, 4) of the normalised image planes."""
+    x1, y1, x2, y2 = (np.ascontiguousarray(column) for column in correspondences.T)  # (N,) each
+    rays = R @ np.stack([x1, y1, np.ones_like(x1)])  # (H, 3, N), of image 1 in the second camera
+    r0, r1, r2 = rays[:, 0], rays[:, 1], rays[:, 2]  # (H, N)
+    t0, t1, t2 = (t[:, i, None] for i in range(3))
+    l0, l1, l2 = t1 * r2 - t2 * r1, t2 * r0 - t0 * r2, t0 * r1 - t1 * r0  # epipolar lines t × R x1 in image 2
+    error = l0 * x2 + l1 * y2 + l2
+    n0, n1, n2 = y2 * t2 - t1, t0 - x2 * t2, x2 * t1 - y2 * t0  # x2 × t; lines in image 1 are Rᵀ of it
+    m0 = R[:, 0, 0, None] * n0 + R[:, 1, 0, None] * n1 + R[:, 2, 0, None] * n2
+    m1 = R[:, 0, 1, None] * n0 + R[:, 1, 1, None] * n1 + R[:, 2, 1, None] * n2
+    squared_norm = np.maximum(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1, np.finfo(np.float64).tiny)
+    distance_px = np.abs(error) * (focal_px / np.sqrt(squared_norm))
+    aa, bb = x1 * x1 + y1 * y1 + 1.0, x2 * x2 + y2 * y2 + 1.0  # a rotation keeps the length of a ray
+    ab = r0 * x2 + r1 * y2 + r2
+    at, bt = r0 * t0 + r1 * t1 + r2 * t2, x2 * t0 + y2 * t1 + t2
+    parallax = aa * bb - ab * ab > (MIN_PARALLAX_PX / focal_px) ** 2 * aa * bb
+    return Residuals(distance_px, ((ab * bt < bb * at) | (aa * bt < ab * at)) & parallax)
+
+
+def pairwise_angles_deg(R: Array, t: Array, R_other: Array, t_other: Array) -> Array:
+    """Larger of the angles of rotation and of direction (sign ignored) between poses, (H, G) degrees."""
+    cosine = (np.tensordot(R, R_other, axes=([1, 2], [1, 2])) - 1.0) / 2.0
+    rotation = np.arccos(np.clip(cosine, -1.0, 1.0))
+    direction = np.arccos(np.clip(np.abs(t @ t_other.T), 0.0, 1.0))
+    return np.asarray(np.degrees(np.maximum(rotation, direction)))
+
+
+def log_likelihoods(residuals: Residuals, probability: Array, coefficients: Coefficients) -> Array:
+    """Log-likelihood ratios (H, S) against all matches being wrong, for each scale of the noise.
+
+    Args:
+        probability: (N,) that a match is right, below 1.
+        coefficients: ``noise_px`` and ``noise_weights`` of the mixture, ``noise_scales``, ``outlier_width_px``: the
+            width across which a wrong match may lie; ``seen_behind``: share of right matches that lie behind a camera
+            all the same, because they are off *along* their epipolar line, as in a corridor walked down.
+    """
+    odds = coefficients["outlier_width_px"][0] * np.sqrt(2.0 / np.pi) * probability / (1.0 - probability)  # (N,)
+    odds = odds * np.where(residuals.behind, coefficients["seen_behind"][0], 1.0)  # (H, N)
+    squared = residuals.distance_px**2
+    columns = []
+    for scale in coefficients["noise_scales"]:
+        density = np.zeros_like(squared)
+        for sigma, weight in zip(coefficients["noise_px"], coefficients["noise_weights"]):
+            density += (weight / (scale * sigma)) * np.exp((-0.5 / (scale * sigma) ** 2) * squared)
+        columns.append(np.log1p(odds * density).sum(axis=1))
+    return np.stack(columns, axis=1)
+
+
+def prior(scores: Array, coefficients: Coefficients) -> Array:
+    """Probability (N,) that a match is right as the likelihood believes it: ``trust · score ** power + floor``."""
+    trust, power, floor = coefficients["score_trust"]
+    return np.minimum(trust * scores**power + floor, 0.98)
+
+
+def judge(
+    correspondences: Array,
+    scores: Array | None,
+    hypotheses: Hypotheses,
+    focal_px: float,
+    network_poses: tuple[Array, Array] | None,
+    coefficients: Coefficients,
+) -> Judgement:
+    """Choose among hypotheses and measure the chosen one.
+
+    Args:
+        correspondences: (N, 4) on the normalised image planes, each keypoint once.
+        scores: (N,) probabilities of the matches; None before the network.
+        focal_px: mean focal length, pixels.
+        network_poses: R (G, 3, 3), t (G, 3): the poses that the network's own E allows, or None.
+        coefficients: see :func:`log_likelihoods` and :func:`prior`.
+    """
+    residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px)
+    distance, front = residuals.distance_px, ~residuals.behind
+    count = len(correspondences)
+    near = (distance < 1.0) & front  # (H, N)
+    inliers = near.sum(axis=1)
+    share = float(np.clip(inliers.max() / max(count, 1), MIN_SHARE, MAX_SHARE))
+    plain_by_scale = log_likelihoods(residuals, np.full(count, share), coefficients)
+    if scores is None:
+        weights, by_scale = np.full(count, share), plain_by_scale
+    else:
+        weights, by_scale = scores, log_likelihoods(residuals, prior(scores, coefficients), coefficients)
+    # One scale for all hypotheses: that of the most likely one.
+    column = int(np.argmax(by_scale.max(axis=0)))
+    likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
+    chosen = int(np.argmax(likelihood))
+    support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
+    angles = pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[chosen]], hypotheses.t[[chosen]])[:, 0]
+    rivals = angles > RIVAL_DEG
+
+    def gap(values: Array) -> float:
+        """How far the chosen one lies above the best of those that are another answer."""
+        return float(values[chosen] - (values[rivals].max() if rivals.any() else 0.0))
+
+    other = hypotheses.family != hypotheses.family[chosen]
+    agreeing = [len(set(hypotheses.family[other & (angles < limit)].tolist())) for limit in AGREEMENT_DEG]
+    to_network = 180.0
+    if network_poses is not None:
+        to_network = float(pairwise_angles_deg(hypotheses.R[[chosen]], hypotheses.t[[chosen]], *network_poses).min())
+    low, high = BACKGROUND_PX
+    around = (distance[chosen] > low) & (distance[chosen] < high)
+    background = np.array([around.sum(), weights[around].sum()]) / (high - low)
+    number, weighted = float(inliers[chosen]), float(weights[near[chosen]].sum())
+    scale = float(coefficients["noise_scales"][column])
+    spread = pose_uncertainty_deg(
+        correspondences[(distance[chosen] < 3.0 * NOISE_PX * scale) & front[chosen]],
+        hypotheses.R[chosen],
+        hypotheses.t[chosen],
+        NOISE_PX * scale / focal_px,
+    )
+    everything_near = int(np.count_nonzero(distance[chosen] < 1.0))
+    features = {
+        "log count": np.log(number + 1.0),
+        "log weighted count": np.log(weighted + 1.0),
+        "log share": np.log((number + 1.0) / (count + 2.0)),
+        "log weighted share": np.log((weighted + 0.1) / (weights.sum() + 0.2)),
+        "log significance": _significance(number, background[0]),
+        "log weighted significance": _significance(weighted, background[1]),
+        "likelihood per inlier": likelihood[chosen]
+        / (np.count_nonzero((distance[chosen] < 2.0) & front[chosen]) + 5.0),
+        "likelihood to rival": np.arcsinh(gap(likelihood) / GAP_UNIT),
+        "plain likelihood to rival": np.arcsinh(gap(plain) / GAP_UNIT),
+        "support to rival": np.arcsinh(gap(support) / GAP_UNIT),
+        "plain likelihood to best": np.arcsinh((plain[chosen] - plain.max()) / GAP_UNIT),
+        "weighted support to best": np.arcsinh((support[chosen] - support.max()) / GAP_UNIT),
+        "share behind": 1.0 - number / max(everything_near, 1),
+        "near network E 3 deg": np.exp(-to_network / 3.0),
+        "near network E 10 deg": np.exp(-to_network / 10.0),
+        "no network E": float(network_poses is None),
+        **{f"other families within {limit:g} deg": float(n) for limit, n in zip(AGREEMENT_DEG, agreeing)},
+        "log scale": np.log(scale),
+        "log matches": np.log(count + 1.0),
+        "log sum of scores": np.log(weights.sum() + 1.0),
+        "log uncertainty deg": np.log(spread),
+    }
+    distances = np.where(front[chosen], distance[chosen], np.inf)
+    return Judgement(chosen, {k: float(v) for k, v in features.items()}, likelihood, distances, share, scale)
+
+
+def confidence(judgement: Judgement, coefficients: Coefficients) -> float:
+    """Probability that the chosen pose is within 10 degrees."""
+    return _logistic(judgement, FEATURES, coefficients["confidence"])
+
+
+def early_confidence(judgement: Judgement, coefficients: Coefficients) -> float:
+    """The same for a choice without a network."""
+    return _logistic(judgement, EARLY_FEATURES, coefficients["early_confidence"])
+
+
+def explains_list(judgement: Judgement, coefficients: Coefficients) -> bool:
+    """True where a pose found without the network needs none: the rule of the early end.
+
+    It explains enough of the list, by enough matches, which all lie in front of the cameras and hold it firmly, and no
+    other answer, a twin under the dominant plane above all, comes near. ``coefficients["early_end"]``: least share,
+    least count, largest share behind, largest uncertainty in degrees, least log-likelihood above the best rival.
+    """
+    share, number, behind, uncertainty_deg, gap = coefficients["early_end"]
+    f = judgement.features
+    return (
+        f["log share"] > np.log(share)
+        and f["log count"] > np.log(number)
+        and f["share behind"] < behind
+        and f["log uncertainty deg"] < np.log(uncertainty_deg)
+        and f["plain likelihood to rival"] > np.arcsinh(gap / GAP_UNIT)
+    )
+
+
+def posterior(residuals: Residuals, groups: Sequence[BoolArray], scale: float, coefficients: Coefficients) -> Array:
+    """Probability (N,) that each match is right, from its residual alone: the scores of a pair that ended early.
+
+    Args:
+        residuals: of one hypothesis, (1, N).
+        groups: masks (N,) of matches that are right about equally often; each has its own share, found by expectation
+            maximisation. What is in none gets 0.
+        scale: of the noise, by which :data:`NOISE_PX` is multiplied.
+        coefficients: see :func:`log_likelihoods`.
+    """
+    squared = residuals.distance_px[0] ** 2
+    density = np.zeros_like(squared)
+    for sigma, weight in zip(coefficients["noise_px"], coefficients["noise_weights"]):
+        density += np.sqrt(2.0 / np.pi) * (weight / (scale * sigma)) * np.exp((-0.5 / (scale * sigma) ** 2) * squared)
+    ratio = coefficients["outlier_width_px"][0] * density
+    ratio = ratio * np.where(residuals.behind[0], coefficients["seen_behind"][0], 1.0)
+    probability = np.zeros_like(squared)
+    for group in groups:
+        share = 0.5
+        for _ in range(_SHARE_ROUNDS if group.any() else 0):
+            odds = share / (1.0 - share) * ratio[group]
+            probability[group] = odds / (1.0 + odds)
+            share = float(np.clip(probability[group].mean(), _LEAST_SHARE, _LARGEST_SHARE))
+    return np.asarray(probability)
+
+
+def _significance(count: float, background: float) -> float:
+    """log(1 + improbability) of seeing ``count`` where ``background`` is expected (Poisson, large deviations)."""
+    expected = background + 0.5
+    if count <= expected:
+        return 0.0
+    return float(np.log1p(count * np.log(count / expected) - (count - expected)))
+
+
+def _logistic(judgement: Judgement, names: Sequence[str], weights: Sequence[float]) -> float:
+    logit = sum(judgement.features[name] * weight for name, weight in zip(names, weights)) + weights[-1]
+    return float(1.0 / (1.0 + np.exp(-np.clip(logit, -40.0, 40.0))))
