@@ -162,6 +162,7 @@ class MatchFilter:
             info={
                 **self._describe(job),
                 "logits": logits,
+                "num_accepted": self._count_accepted(job.sent, logits),
                 "fitted_essential": None if model is None else model.E,
                 "origin": None if model is None else model.origin,
                 **verdict.info,
@@ -180,6 +181,10 @@ class MatchFilter:
             )
         ]
         return RankedMatches.of(pair.correspondences, order, scores, margins)
+
+    def _count_accepted(self, sent: NetworkInput, logits: NDArray[np.float32]) -> int:
+        """How many of the matches that the network saw lie above its decision threshold."""
+        return int(np.count_nonzero(logits[sent.rows] > self._backend.metadata.decision_threshold))
 
     def _keep_by_scores(self, pair: PairInput, scores: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Mask (M,) that asks the network alone."""

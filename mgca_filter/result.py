@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .drawing import MatchPanel, draw_matches
+from .verdict_text import describe_verdict
 
 
 class Status(str, enum.Enum):
@@ -56,11 +57,11 @@ class FilterResult:
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches``,
-            ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
-            robust fit left it, before the verdict, and its ``origin`` ("network", "start 1", …, "plane"). Where they
-            were measured: ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography``
-            (3, 3) that explains the pair, ``focal_factor`` where the matches ask for focal lengths that many times
-            those given (rough, a power of 1.2).
+            ``num_accepted`` (those of them above the decision threshold), ``network_essential`` (3, 3) or None as the
+            network gave it, ``fitted_essential`` (3, 3) or None as the robust fit left it, before the verdict, and its
+            ``origin`` ("network", "start 1", …, "plane"). Where they were measured: ``support`` (number of accepted
+            matches that agree), ``log10_false_alarms``, ``homography`` (3, 3) that explains the pair,
+            ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of 1.2).
     """
 
     mask: NDArray[np.bool_]
@@ -130,3 +131,25 @@ class FilterResult:
     def __repr__(self) -> str:
         """The verdict and the counts; the arrays would fill the screen."""
         return f"FilterResult(status={self.status.value!r}, {self.num_inliers} of {len(self.mask)} matches kept)"
+
+    def _repr_html_(self) -> str:
+        """The verdict in words and the counts as a small table, for notebooks."""
+        confidence = getattr(self, "confidence", None)
+        verdict = describe_verdict(
+            self.status.value,
+            guessed=self.info.get("intrinsics") == "guessed",
+            confidence=confidence,
+            focal_factor=self.info.get("focal_factor"),
+        )
+        rows = {"status": self.status.value, "kept": f"{self.num_inliers} of {len(self.mask)} matches"}
+        if self.R is not None:
+            cosine = (float(np.trace(self.R)) - 1.0) / 2.0
+            rows["rotation"] = f"{np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.1f}°"
+        if self.t is not None:
+            rows["translation"] = ", ".join(f"{value:+.2f}" for value in self.t)
+        if confidence is not None:
+            rows["confidence"] = f"{100.0 * confidence:.0f} %"
+        cells = "".join(
+            f"<tr><th style='text-align:left'>{name}</th><td>{word}</td></tr>" for name, word in rows.items()
+        )
+        return f"<p><b>{verdict.headline}</b><br>{verdict.advice}</p><table>{cells}</table>"
