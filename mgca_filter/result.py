@@ -61,7 +61,8 @@ class FilterResult:
             network gave it, ``fitted_essential`` (3, 3) or None as the robust fit left it, before the verdict, and its
             ``origin`` ("network", "start 1", …, "plane"). Where they were measured: ``support`` (number of accepted
             matches that agree), ``log10_false_alarms``, ``homography`` (3, 3) that explains the pair,
-            ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of 1.2).
+            ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of
+            1.2).
     """
 
     mask: NDArray[np.bool_]
