@@ -14,7 +14,6 @@ Image = NDArray[np.uint8]
 
 MAX_SIDE_PX = 1600
 _QUALITIES = (88, 80, 72, 64, 56, 48)
-_LEAST_SIDE_PX = 160
 _NOTHING = 65535  # code of NaN
 
 
@@ -35,11 +34,13 @@ def as_bgr(image: Any, name: str) -> Image:
     return np.ascontiguousarray(array[:, :, :3])
 
 
-def embed_images(images: Sequence[Image], budget_bytes: int, max_side_px: int = MAX_SIDE_PX) -> list[str]:
+def embed_images(
+    images: Sequence[Image], budget_bytes: int, max_side_px: int = MAX_SIDE_PX, least_side_px: int = 160
+) -> list[str]:
     """JPEG data addresses of BGR images that have ``budget_bytes`` characters together, at most.
 
-    The longer side is at most ``max_side_px``. Quality is lowered first, then size; what is over the budget at 160 px
-    is embedded all the same.
+    The longer side is at most ``max_side_px``. Quality is lowered first, then size; what is over the budget at
+    ``least_side_px`` is embedded all the same.
     """
     side = max_side_px
     while True:
@@ -48,9 +49,9 @@ def embed_images(images: Sequence[Image], budget_bytes: int, max_side_px: int = 
             encoded = [_data_address(image, quality) for image in shrunk]
             if sum(map(len, encoded)) <= budget_bytes:
                 return encoded
-        if side <= _LEAST_SIDE_PX:
+        if side <= least_side_px:
             return encoded
-        side = max(_LEAST_SIDE_PX, int(side * 0.8))
+        side = max(least_side_px, int(side * 0.8))
 
 
 def _shrink(image: Image, side: int) -> Image:

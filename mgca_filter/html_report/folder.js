@@ -72,7 +72,7 @@ const matrix = new Surface(byId("matrix"), (context, width, height) => {
   const cell = Math.min(width, height) / Math.max(n, 1);
   for (const [style, lineWidth] of [["#000", 4], [PALETTE.pin, 2]]) {
     [context.strokeStyle, context.lineWidth] = [style, lineWidth];
-    context.strokeRect(c * cell, r * cell, cell, cell);
+    context.strokeRect(c * cell + 1, r * cell + 1, cell - 2, cell - 2);
   }
 });
 const repaint = () => { stale = true; matrix.invalidate(); };

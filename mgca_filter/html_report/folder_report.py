@@ -19,7 +19,7 @@ from .page import LIMIT_BYTES, build_page
 
 MAX_PAIRS_SHOWN = 30_000
 _SCRIPTS = ("shell.js", "folder.js")
-_THUMBNAIL_PX = 120
+_THUMBNAIL_PX = (48, 320)
 _LINKS_SHOWN = 60
 _SPARE_BYTES = 4_000
 _THIN_LINK = 30  # matches; what reconstruction programs ask of a pair that they start from
@@ -109,7 +109,10 @@ def write_folder_report(
         frame = len(build_page(window, "folder.html", words, _SCRIPTS, data).encode("utf-8"))
         room = LIMIT_BYTES - frame - _SPARE_BYTES - sum(len(name.encode("utf-8")) * 6 + 8 for name in held)
         pictures = [as_bgr(thumbnails[name], f"thumbnails[{name!r}]") for name in held]
-        encoded = embed_images(pictures, room, _THUMBNAIL_PX) if pictures else []
+        least, most = _THUMBNAIL_PX
+        # A JPEG file takes about a third of a byte a pixel: start there rather than at the largest.
+        side = min(max(int((3.0 * max(room, 0) / max(len(held), 1)) ** 0.5), least), most)
+        encoded = embed_images(pictures, room, side, least) if pictures else []
         if sum(map(len, encoded)) <= room:
             data["thumbnails"] = dict(zip(held, encoded))
     page = build_page(window, "folder.html", words, _SCRIPTS, data)

@@ -140,24 +140,18 @@ function createScene(viewer, onPin) {
     cameras.forEach((camera, k) => {
       if (camera.dashed && !options.truth) return;
       if (k === eye) {
-        context.globalAlpha = 0.6;
-        if (options.photos) paintPicture(context, viewer.pictures[k], camera.corners.map(([x, y]) => project(camera.place([x, y, 1]))));
-        context.globalAlpha = 1;
+        if (options.photos) paintOwnView(context, viewer.pictures[k], camera.corners.map(([x, y]) => project(camera.place([x, y, 1]))));
         return;
       }
       const corners = camera.corners.map(([x, y]) => camera.place([x * frustum, y * frustum, frustum]));
       if (options.photos && camera.picture != null) {
-        context.globalAlpha = 0.75;
         paintPicture(context, viewer.pictures[camera.picture], corners.map(project));
-        context.globalAlpha = 1;
       }
       const dash = camera.dashed ? [5, 5] : [];
       corners.forEach((corner, i) => {
         stroke(context, project, [apices[k], corner], camera.colour || ink, 1.4, dash);
         stroke(context, project, [corner, corners[(i + 1) % 4]], camera.colour || ink, 2.2, dash);
       });
-      const [x, y, d] = project(apices[k]);
-      if (d > 0.02) label(context, x, y + (camera.dashed ? 28 : 14), camera.name, camera.colour || "#ffffff");
     });
     if (scene.has_baseline && eye === null) stroke(context, project, [apices[0], apices[1]], ink, 1.5, [4, 4]);
     const placed = points.map((p, k) => [...project(p), scene.rows[k], p]).filter((p) => p[2] > 0.02);
@@ -177,6 +171,11 @@ function createScene(viewer, onPin) {
       context.fill();
       context.stroke();
     }
+    cameras.forEach((camera, k) => {
+      const [x, y, d] = project(apices[k]);
+      const hidden = k === eye || (camera.dashed && !options.truth);
+      if (d > 0.02 && !hidden) label(context, x + (camera.dashed ? 40 : k === 0 && !scene.has_baseline ? -26 : 0), y - 14, camera.name, camera.colour || "#ffffff");
+    });
     const pinned = placed.find((p) => p[3] === state.pin);
     if (pinned) {
       [0, 1].forEach((k) => k !== eye && stroke(context, project, [apices[k], pinned[4]], PALETTE.pin, 2));
@@ -185,6 +184,14 @@ function createScene(viewer, onPin) {
       [context.strokeStyle, context.lineWidth] = [PALETTE.pin, 2.5];
       context.stroke();
     }
+  }
+
+  // What a camera saw, faded, as the background of the view through it.
+  function paintOwnView(context, picture, [[left, top], , [right, bottom]]) {
+    if (!picture.naturalWidth) return;
+    context.globalAlpha = 0.6;
+    context.drawImage(picture, left, top, right - left, bottom - top);
+    context.globalAlpha = 1;
   }
 
   function label(context, x, y, words, colour) {
@@ -248,16 +255,16 @@ function createScene(viewer, onPin) {
     surface.invalidate();
   }
 
-  function look(through) {
+  function look(through, id = null) {
     eye = through;
-    views.forEach(([button, value]) => button.setAttribute("aria-pressed", String(value === eye && (value !== null || button.id === "look-free"))));
+    views.forEach((one) => one.setAttribute("aria-pressed", String(one.id === id)));
     surface.invalidate();
   }
 
-  const button = (id, words, through, set) => el("button", { type: "button", id, "aria-pressed": "false", onclick: () => { if (set) view = { ...start, distance: 0, ...set }; look(through); } }, words);
+  const button = (id, words, through, set) => el("button", { type: "button", id, "aria-pressed": "false", onclick: () => { if (set) view = { ...start, distance: 0, ...set }; look(through, id); } }, words);
   const views = [
-    [button("look-free", "Side", null, {}), null], [button("look-above", "Above", null, { yaw: 0, pitch: 1.5 }), null],
-    [button("look-1", "Camera 1", 0), 0], [button("look-2", "Camera 2", 1), 1],
+    button("look-free", "Side", null, {}), button("look-above", "Above", null, { yaw: 0, pitch: 1.5 }),
+    button("look-1", "Camera 1", 0), button("look-2", "Camera 2", 1),
   ];
   const toggle = (name, words) => {
     const box = el("input", { type: "checkbox", id: `scene-${name}`, onchange: () => { options[name] = box.checked; surface.invalidate(); } });
@@ -274,11 +281,11 @@ function createScene(viewer, onPin) {
     ["focal lengths", scene.focal_px.map((f) => count(f)).join(" and ") + ` px, ${scene.guessed ? "guessed" : "given"}`],
     ["pose error", error == null ? null : `${fixed(error, 2)}°`],
   ].filter(([, value]) => value != null);
-  side.append(home, el("div", { class: "card" }, el("h2", {}, "Look from"), el("div", { class: "buttons" }, ...views.map(([b]) => b)),
+  side.append(home, el("div", { class: "card" }, el("h2", {}, "Look from"), el("div", { class: "buttons" }, ...views),
     el("div", { class: "checks" }, toggle("photos", "Photos"), scene.has_baseline ? toggle("rays", "Rays") : null, scene.truth ? toggle("truth", "True camera") : null)),
     el("div", { class: "card" }, el("h2", {}, "Relative pose"), el("dl", { class: "table" }, ...facts.flatMap(([name, value]) => [el("dt", {}, name), el("dd", {}, value)])),
       el("p", { class: "quiet" }, scene.has_baseline ? "Lengths are in baselines: two views do not tell metres." : "The camera turned on the spot, so that no point has a depth."),
       scene.guessed ? el("p", { class: "quiet" }, "The focal length is a guess, and the shape of the scene with it.") : null));
-  look(null);
-  return { available: true, home, invalidate: () => surface.invalidate(), move: turn, reset: () => { view = { ...start, distance: 0 }; look(null); }, zoom, surface };
+  look(null, "look-free");
+  return { available: true, home, invalidate: () => surface.invalidate(), move: turn, reset: () => { view = { ...start, distance: 0 }; look(null, "look-free"); }, zoom, surface };
 }

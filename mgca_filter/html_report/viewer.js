@@ -5,10 +5,11 @@ function createViewer(onHover, onPin) {
   const pictures = DATA.images.map((address) => Object.assign(new Image(), { src: address, alt: "" }));
   const views = [{}, {}];
   let panes = [];
+  let whole = true; // both images are shown whole, and stay so when the window changes
   const GAP = 8;
 
   const surface = new Surface(canvas, paint);
-  surface.onresize = fit;
+  surface.onresize = () => (whole ? fit() : keepCentres());
   pictures.forEach((picture) => picture.addEventListener("load", () => { surface.invalidate(); onHover(); }));
   fit();
 
@@ -31,9 +32,19 @@ function createViewer(onHover, onPin) {
     return Math.min(panes[side].w / DATA.sizes[side][0], panes[side].h / DATA.sizes[side][1]);
   }
 
+  function keepCentres() {
+    const before = panes;
+    layout();
+    panes.forEach((pane, side) => {
+      views[side].x += pane.x + pane.w / 2 - before[side].x - before[side].w / 2;
+      views[side].y += pane.y + pane.h / 2 - before[side].y - before[side].h / 2;
+    });
+  }
+
   function fit() {
     layout();
     if (!panes.length) return;
+    whole = true;
     panes.forEach((pane, side) => {
       const s = fitScale(side);
       views[side] = { s, x: pane.x + (pane.w - DATA.sizes[side][0] * s) / 2, y: pane.y + (pane.h - DATA.sizes[side][1] * s) / 2 };
@@ -56,6 +67,7 @@ function createViewer(onHover, onPin) {
     view.x = sx - ((sx - view.x) * s) / view.s;
     view.y = sy - ((sy - view.y) * s) / view.s;
     view.s = s;
+    whole = false;
     surface.invalidate();
   }
 
@@ -69,11 +81,13 @@ function createViewer(onHover, onPin) {
       view.x += dx;
       view.y += dy;
     });
+    whole = false;
     surface.invalidate();
   }
 
   // Both images at a match, at a scale where a keypoint can be judged.
   function goTo(i) {
+    whole = false;
     panes.forEach((pane, side) => {
       const s = Math.max(views[side].s, fitScale(side) * 4);
       views[side] = { s, x: pane.x + pane.w / 2 - (matches.x[side][i] + 0.5) * s, y: pane.y + pane.h / 2 - (matches.y[side][i] + 0.5) * s };

@@ -43,7 +43,7 @@ def open_page(path: Path, profile: Path, *flags: str, place: str = "") -> Page:
     return Page(done.stdout, complaints)
 
 
-def ask(path: Path, folder: Path, checks: str, name: str, argument: Any = None) -> Any:
+def ask(path: Path, folder: Path, checks: str, name: str, argument: Any = None, flags: tuple[str, ...] = ()) -> Any:
     """Run one of the functions of a file of checks in a copy of the page and give back what it returns.
 
     The copy lacks the page's policy, which forbids every script but its own; that the policy works is a test of its
@@ -56,7 +56,7 @@ def ask(path: Path, folder: Path, checks: str, name: str, argument: Any = None) 
     asked = f"<script>(() => {{\n{scripts}\n{call}\n}})();</script></body>"
     copy = folder / "asked.html"
     copy.write_text(page_text.replace("</body>", asked), encoding="utf-8")
-    page = open_page(copy, folder / "profile")
+    page = open_page(copy, folder / "profile", *flags)
     assert page.complaints == []
     found_outcome = re.search(r'<pre id="outcome">(.*?)</pre>', page.dom, re.DOTALL)
     assert found_outcome, "the checks did not end"

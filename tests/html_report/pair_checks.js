@@ -10,6 +10,13 @@ const CHECKS = {
     return { title: document.title, names: words(".name"), images: document.images.length };
   },
 
+  async theme() {
+    const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    const background = getComputedStyle(document.body).backgroundColor;
+    press("d");
+    return { dark, background, other: getComputedStyle(document.body).backgroundColor };
+  },
+
   async sliders() {
     set("slider-residual", Math.log10(0.4));
     const near = text("live-count");

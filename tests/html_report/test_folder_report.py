@@ -113,6 +113,7 @@ def test_large_folders_stay_small(tmp_path):
     path = write_folder_report(tmp_path / "f.html", rows, thumbnails=thumbnails)
     assert len(rows) > MAX_PAIRS_SHOWN
     assert path.stat().st_size <= LIMIT_BYTES
+    assert path.read_text(encoding="utf-8").count("data:image/jpeg") == 400
 
 
 def test_thumbnails_must_be_images(tmp_path):

@@ -187,6 +187,15 @@ def test_the_address_says_how_it_opens(report, tmp_path, theme):
     assert re.search(r'id="tab-why"[^>]*aria-selected="true"', page.dom)
 
 
+def test_light_and_dark_follow_the_system_until_the_reader_says_otherwise(report, tmp_path):
+    seen = [
+        ask(report, tmp_path, CHECKS, "theme", flags=(f"--blink-settings=preferredColorScheme={scheme}",))
+        for scheme in (0, 1)
+    ]
+    assert sorted(one["dark"] for one in seen) == [False, True]
+    assert seen[0]["background"] == seen[1]["other"] != seen[0]["other"] == seen[1]["background"]
+
+
 @pytest.mark.parametrize("kind", ["unrelated", "rotation", "empty"])
 def test_pairs_without_a_model_open_as_well(tmp_path, model_file, kind):
     scene = make_scene("rotation") if kind == "rotation" else make_scene(right=0, wrong=200)
