@@ -43,8 +43,8 @@ def open_page(path: Path, profile: Path, *flags: str, place: str = "") -> Page:
     return Page(done.stdout, complaints)
 
 
-def ask(path: Path, folder: Path, checks: str, name: str, argument: Any = None, flags: tuple[str, ...] = ()) -> Any:
-    """Run one of the functions of a file of checks in a copy of the page and give back what it returns.
+def ask(path: Path, folder: Path, checks: str, questions: dict[str, Any], *flags: str) -> dict[str, Any]:
+    """Run functions of a file of checks in a copy of the page, each with its argument, and give back what they return.
 
     The copy lacks the page's policy, which forbids every script but its own; that the policy works is a test of its
     own.
@@ -52,14 +52,13 @@ def ask(path: Path, folder: Path, checks: str, name: str, argument: Any = None, 
     page_text, found = _POLICY.subn("", path.read_text(encoding="utf-8"))
     assert found == 1
     scripts = "".join((_HERE / file).read_text(encoding="utf-8") for file in (checks, "harness.js"))
-    call = f"addEventListener('load', () => setTimeout(() => answer({json.dumps(name)}, {json.dumps(argument)}), 300));"
+    call = f"addEventListener('load', () => setTimeout(() => answer({json.dumps(questions)}), 300));"
     asked = f"<script>(() => {{\n{scripts}\n{call}\n}})();</script></body>"
     copy = folder / "asked.html"
     copy.write_text(page_text.replace("</body>", asked), encoding="utf-8")
     page = open_page(copy, folder / "profile", *flags)
     assert page.complaints == []
-    found_outcome = re.search(r'<pre id="outcome">(.*?)</pre>', page.dom, re.DOTALL)
-    assert found_outcome, "the checks did not end"
-    outcome = json.loads(html.unescape(found_outcome[1]))
-    assert not (isinstance(outcome, dict) and "error" in outcome), outcome["error"]
-    return outcome
+    outcome = re.search(r'<pre id="outcome">(.*?)</pre>', page.dom, re.DOTALL)
+    assert outcome, "the checks did not end"
+    answers: dict[str, Any] = json.loads(html.unescape(outcome[1]))
+    return answers

@@ -1,5 +1,10 @@
 // What the tests of a folder's page do to it, by name; each returns what it saw.
 
+function tidy() {
+  set("filter", "");
+  report.goToPair(...report.links[0]);
+}
+
 const CHECKS = {
   async table() {
     const kept = () => words("#pairs tbody td:nth-child(5)").map(Number);

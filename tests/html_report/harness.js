@@ -27,12 +27,16 @@ const countColours = (canvas) => new Set(new Uint32Array(pixelsOf(canvas).buffer
 
 HTMLCanvasElement.prototype.setPointerCapture = () => {}; // refuses pointers that are not there
 
-async function answer(name, argument) {
-  let outcome;
-  try {
-    outcome = await CHECKS[name](argument);
-  } catch (error) {
-    outcome = { error: String(error.stack || error) };
+// One after the other in one page, which `tidy` brings back to how it opened; an error is the outcome of its check.
+async function answer(questions) {
+  const outcome = {};
+  for (const [name, argument] of Object.entries(questions)) {
+    try {
+      outcome[name] = await CHECKS[name](argument);
+    } catch (error) {
+      outcome[name] = { error: String(error.stack || error) };
+    }
+    tidy();
   }
   const node = document.createElement("pre");
   node.id = "outcome";

@@ -5,6 +5,17 @@ const at = (side, row) => report.viewer.toScreen(side, report.matches.x[side][ro
 // Nobody watches, so that no frame is ever due: the picture is drawn when it is asked for.
 const draw = (surface) => surface.resize();
 
+function tidy() {
+  const { state, viewer, open } = report;
+  byId("keys").close();
+  byId("reset").click();
+  Object.assign(state, { kept: true, rejected: false, lines: false, colour: "position" });
+  Object.assign(state.groups, { both: true, ours: true, theirs: true, neither: false });
+  viewer.pinMatch(-1);
+  viewer.fit();
+  open("matches");
+}
+
 const CHECKS = {
   async names() {
     return { title: document.title, names: words(".name"), images: document.images.length };
@@ -110,7 +121,7 @@ const CHECKS = {
     const row = (name) => words(`.group.${name} b`).map((word) => Number(word.replace(/[^0-9]/g, "")));
     const cells = [...document.querySelectorAll("#side-compare tbody tr")].map((tr) => [...tr.children].map((c) => c.textContent.trim()));
     const tally = Object.fromEntries(["both", "ours", "theirs", "neither"].map((name) => [name, row(name)]));
-    return { tally, cells, groups: report.state.groups, only: byId("differences").checked };
+    return { tally, cells, groups: { ...report.state.groups }, only: byId("differences").checked };
   },
 
   async scene() {

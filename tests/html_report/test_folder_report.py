@@ -141,9 +141,15 @@ def test_the_page_runs_under_its_own_policy(report, tmp_path):
     assert 'src="x"' not in page.dom
 
 
+@pytest.fixture(scope="module")
+def seen(report, tmp_path_factory):
+    """What all checks saw, by name."""
+    return ask(report, tmp_path_factory.mktemp("asked"), "folder_checks.js", {"matrix": None, "table": None})
+
+
 @needs_chromium
-def test_table_sorts_and_filters(report, tmp_path):
-    seen = ask(report, tmp_path, "folder_checks.js", "table")
+def test_table_sorts_and_filters(seen):
+    seen = seen["table"]
     assert seen["first"] == [300, 150, 12, 0]
     assert seen["up"] == [0, 12, 150, 300]
     assert seen["byTotal"] == [300, 12, 0, 150]
@@ -155,8 +161,8 @@ def test_table_sorts_and_filters(report, tmp_path):
 
 
 @needs_chromium
-def test_matrix_links_and_keys(report, tmp_path):
-    seen = ask(report, tmp_path, "folder_checks.js", "matrix")
+def test_matrix_links_and_keys(seen):
+    seen = seen["matrix"]
     assert seen["start"] == "ok, 12 of 800 kept, confidence 40 %"
     assert seen["colours"] > 4
     assert seen["links"] == ["b.jpg – c.jpg", f"c.jpg – {EVIL}", "a.jpg – b.jpg"]

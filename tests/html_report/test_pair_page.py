@@ -43,9 +43,19 @@ def report(tmp_path_factory, result, rival):
     )  # fmt: skip
 
 
-@pytest.fixture
-def asked(report, tmp_path):
-    return lambda name, argument=None: ask(report, tmp_path, CHECKS, name, argument)
+@pytest.fixture(scope="module")
+def rows(result) -> dict[str, int]:
+    """The kept matches that a check is about."""
+    kept = np.flatnonzero(result.mask)
+    return {"hover": int(kept[7]), "epipolarLine": int(kept[3])}
+
+
+@pytest.fixture(scope="module")
+def seen(report, rows, tmp_path_factory):
+    """What all checks saw, by name."""
+    names = ("names", "sliders", "hover", "epipolarLine", "looseClick", "keys", "wheelAndDrag", "comparison", "scene")
+    questions = {name: rows.get(name) for name in (*names, "colours", "unnamed")}
+    return ask(report, tmp_path_factory.mktemp("asked"), CHECKS, questions)
 
 
 def test_the_page_runs_under_its_own_policy(report, tmp_path, result):
@@ -66,15 +76,15 @@ def test_the_policy_stops_a_script_that_is_not_the_page_s_own(report, tmp_path):
     assert any("Content Security Policy" in line for line in page.complaints)
 
 
-def test_a_name_is_text_and_nothing_else(asked):
-    seen = asked("names")
+def test_a_name_is_text_and_nothing_else(seen):
+    seen = seen["names"]
     assert seen["names"] == ["one.jpg", NAME]
     assert seen["images"] == 0
     assert NAME in seen["title"]
 
 
-def test_sliders_count_as_numpy_does(asked, result):
-    seen = asked("sliders")
+def test_sliders_count_as_numpy_does(seen, result):
+    seen = seen["sliders"]
     x = np.hstack([normalize_points(points, K) for points in (result.points1, result.points2)])
     near = 800 * sampson_distance(x, result.E) <= 0.4
     assert int(seen["near"].split()[0]) == pytest.approx(near.sum(), abs=1)
@@ -87,9 +97,9 @@ def test_sliders_count_as_numpy_does(asked, result):
     assert seen["disabled"]
 
 
-def test_pointing_at_a_match_shows_its_patches_and_numbers(asked, result):
-    row = int(np.flatnonzero(result.mask)[7])
-    seen = asked("hover", row)
+def test_pointing_at_a_match_shows_its_patches_and_numbers(seen, rows, result):
+    row = rows["hover"]
+    seen = seen["hover"]
     assert seen["values"]["score"] == f"{result.scores[row]:.3f}"
     assert seen["values"]["ratio"] == f"{SCENE.attributes.ratio[row]:.2f}"
     assert seen["values"]["residual"].endswith(" px")
@@ -100,9 +110,9 @@ def test_pointing_at_a_match_shows_its_patches_and_numbers(asked, result):
     assert seen["left"] == 0
 
 
-def test_a_click_draws_the_epipolar_line_through_the_match(asked, result):
-    row = int(np.flatnonzero(result.mask)[3])
-    seen = asked("epipolarLine", row)
+def test_a_click_draws_the_epipolar_line_through_the_match(seen, rows, result):
+    row = rows["epipolarLine"]
+    seen = seen["epipolarLine"]
     assert seen["pin"] == row
     expected = result.F @ [*result.points1[row], 1.0]
     cosine = np.dot(expected, seen["line"]) / np.linalg.norm(expected) / np.linalg.norm(seen["line"])
@@ -114,15 +124,15 @@ def test_a_click_draws_the_epipolar_line_through_the_match(asked, result):
     assert f"Match {row + 1}" in seen["status"]
 
 
-def test_a_click_beside_the_matches_draws_a_line_as_well(asked):
-    seen = asked("looseClick")
+def test_a_click_beside_the_matches_draws_a_line_as_well(seen):
+    seen = seen["looseClick"]
     assert seen["spot"]["side"] == 1
     assert (seen["spot"]["x"], seen["spot"]["y"]) == pytest.approx((100, 200), abs=0.01)
     assert seen["after"] is None
 
 
-def test_keys_do_what_the_list_of_keys_says(asked, result):
-    seen = asked("keys")
+def test_keys_do_what_the_list_of_keys_says(seen, result):
+    seen = seen["keys"]
     assert seen["flags"] == [True, True, True, True]
     assert seen["first"] == seen["again"]
     assert result.scores[seen["first"]] == pytest.approx(result.scores.max(), abs=1e-4)
@@ -136,8 +146,8 @@ def test_keys_do_what_the_list_of_keys_says(asked, result):
     assert seen["listed"] > 12
 
 
-def test_wheel_and_drag_move_the_image_under_the_pointer(asked):
-    seen = asked("wheelAndDrag")
+def test_wheel_and_drag_move_the_image_under_the_pointer(seen):
+    seen = seen["wheelAndDrag"]
     x, y = seen["start"]
     assert seen["wheeled"] == pytest.approx([x, y], abs=1.0)  # events of the wheel know whole pixels
     assert seen["dragged"] == pytest.approx([seen["wheeled"][0] + 30, seen["wheeled"][1] - 20], abs=0.01)
@@ -146,8 +156,8 @@ def test_wheel_and_drag_move_the_image_under_the_pointer(asked):
     assert seen["pin"] == -1
 
 
-def test_comparison_counts_who_keeps_what(asked, result, rival):
-    seen = asked("comparison")
+def test_comparison_counts_who_keeps_what(seen, result, rival):
+    seen = seen["comparison"]
     tally = {name: sum(counts) for name, counts in seen["tally"].items()}
     assert tally == {
         "both": np.count_nonzero(result.mask & rival),
@@ -161,8 +171,8 @@ def test_comparison_counts_who_keeps_what(asked, result, rival):
     assert [cells[:2] for cells in seen["cells"]] == [["mgca_filter", kept[0]], ["RANSAC", kept[1]]]
 
 
-def test_the_scene_turns(asked):
-    seen = asked("scene")
+def test_the_scene_turns(seen):
+    seen = seen["scene"]
     assert seen["colours"] > 50
     assert seen["turned"]
     assert seen["through"]
@@ -170,12 +180,12 @@ def test_the_scene_turns(asked):
     assert seen["hidden"]
 
 
-def test_every_way_to_colour_the_matches_looks_different(asked):
-    assert asked("colours") == 4
+def test_every_way_to_colour_the_matches_looks_different(seen):
+    assert seen["colours"] == 4
 
 
-def test_controls_have_names(asked):
-    seen = asked("unnamed")
+def test_controls_have_names(seen):
+    seen = seen["unnamed"]
     assert seen["controls"] > 25
     assert seen["unnamed"] == []
 
@@ -189,7 +199,7 @@ def test_the_address_says_how_it_opens(report, tmp_path, theme):
 
 def test_light_and_dark_follow_the_system_until_the_reader_says_otherwise(report, tmp_path):
     seen = [
-        ask(report, tmp_path, CHECKS, "theme", flags=(f"--blink-settings=preferredColorScheme={scheme}",))
+        ask(report, tmp_path, CHECKS, {"theme": None}, f"--blink-settings=preferredColorScheme={scheme}")["theme"]
         for scheme in (0, 1)
     ]
     assert sorted(one["dark"] for one in seen) == [False, True]
@@ -202,7 +212,9 @@ def test_pairs_without_a_model_open_as_well(tmp_path, model_file, kind):
     count = 0 if kind == "empty" else 200
     answer = MatchFilter(model=model_file).filter(scene.points1[:count], scene.points2[:count], None, K1=K)
     image = np.full((SIZE[1], SIZE[0], 3), 128, np.uint8)
-    seen = ask(write_pair_report(tmp_path / "p.html", image, image, answer, K1=K), tmp_path, CHECKS, "everyTab")
+    seen = ask(
+        write_pair_report(tmp_path / "p.html", image, image, answer, K1=K), tmp_path, CHECKS, {"everyTab": None}
+    )["everyTab"]
     assert seen["headline"].endswith(".")
     assert seen["residual"] == (kind == "rotation")
     assert f"of {count} kept" in seen["live"]
