@@ -197,7 +197,12 @@ class MatchFilter:
             points1=pair.points1,
             points2=pair.points2,
             indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
-            info={**self._describe(job), "logits": logits, **verdict.info},
+            info={
+                **self._describe(job),
+                "logits": logits,
+                "num_accepted": int(np.count_nonzero(logits > self._backend.metadata.decision_threshold)),
+                **verdict.info,
+            },
         )
 
     def _score(self, job: _Job) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

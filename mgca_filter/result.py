@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .drawing import MatchPanel, draw_matches
+from .verdict_text import describe_verdict
 
 
 class Status(str, enum.Enum):
@@ -58,7 +59,7 @@ class FilterResult:
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
             ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
-            ``network_rows`` (those that entered the network),
+            ``network_rows`` (those that entered the network), ``num_accepted`` (those above the decision threshold),
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
             robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",
             "network", "accepted", "score order", …, "plane"), and where the search ``ended`` ("before the network",
@@ -138,3 +139,24 @@ class FilterResult:
         confidence = "" if self.confidence is None else f", confidence {self.confidence:.2f}"
         kept = f"{self.num_inliers} of {len(self.mask)} matches kept"
         return f"FilterResult(status={self.status.value!r}, {kept}{confidence})"
+
+    def _repr_html_(self) -> str:
+        """The verdict in words and the counts as a small table, for notebooks."""
+        verdict = describe_verdict(
+            self.status.value,
+            guessed=self.info.get("intrinsics") == "guessed",
+            confidence=self.confidence,
+            focal_factor=self.info.get("focal_factor"),
+        )
+        rows = {"status": self.status.value, "kept": f"{self.num_inliers} of {len(self.mask)} matches"}
+        if self.R is not None:
+            cosine = (float(np.trace(self.R)) - 1.0) / 2.0
+            rows["rotation"] = f"{np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))):.1f}°"
+        if self.t is not None:
+            rows["translation"] = ", ".join(f"{value:+.2f}" for value in self.t)
+        if self.confidence is not None:
+            rows["confidence"] = f"{100.0 * self.confidence:.0f} %"
+        cells = "".join(
+            f"<tr><th style='text-align:left'>{name}</th><td>{word}</td></tr>" for name, word in rows.items()
+        )
+        return f"<p><b>{verdict.headline}</b><br>{verdict.advice}</p><table>{cells}</table>"

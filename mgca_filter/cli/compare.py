@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..fit.evidence import Evidence, one_to_one
+from ..fit.evidence import Evidence, distinct_rows, one_to_one
 from ..fit.robust_fit import fit_alone
 from ..geometry.cameras import mean_focal_length, resolve_intrinsics
 from ..geometry.epipolar import rotation_error_deg, sampson_distance
@@ -69,10 +69,11 @@ def fit_baselines(
     fits = []
     for name, method in BASELINES.items():
         start = time.perf_counter()
-        rows = one_to_one(correspondences, np.arange(len(correspondences)))
+        rows = np.sort(distinct_rows(correspondences))
         evidence = Evidence(
             rows,
             correspondences[rows],
+            one_to_one(correspondences[rows]),
             np.ones(len(rows), dtype=bool),
             np.full(len(rows), np.nan),
             focal_px,

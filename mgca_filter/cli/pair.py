@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ from .arguments import (
     quiet_codecs,
 )
 from .compare import BaselineFit, comparison_table, fit_baselines
-from .report import MatchReport, picture, summary, to_json, write_npz
+from .report import MatchReport, picture, summary, to_json, write_html, write_npz
 
 _USAGE = """\
 %(prog)s [options] img1 img2
@@ -67,6 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
     out.add_argument("-o", "--output", metavar="OUT.png", type=Path, help="picture of kept and rejected matches")
     out.add_argument("--json", metavar="FILE", help='pose, status and kept matches; "-" = alone on stdout')
     out.add_argument("--npz", metavar="FILE", type=Path, help="points, scores, mask and models as numpy arrays")
+    out.add_argument("--html", metavar="FILE", type=Path, help="report to look at in a browser, one file")
     out.add_argument("--compare", action="store_true", help="run RANSAC and MAGSAC on the same matches as well")
     out.add_argument("-q", "--quiet", action="store_true", help="no summary, errors only")
     out.add_argument("-v", "--verbose", action="store_true", help="log what is done, on stderr")
@@ -99,7 +101,7 @@ def read_image(path: Path) -> NDArray[np.uint8]:
 def _check_outputs(options: argparse.Namespace) -> None:
     """Complain about output paths before the work rather than after it."""
     json_path = None if options.json in (None, "-") else Path(options.json)
-    for path in (options.output, json_path, options.npz):
+    for path in (options.output, json_path, options.npz, options.html):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
         if path is not None and path.resolve() in (options.image1.resolve(), options.image2.resolve()):
@@ -155,7 +157,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
     return report.with_baselines(baselines)
 
 
-def _write(report: MatchReport, options: argparse.Namespace) -> None:
+def _write(report: MatchReport, options: argparse.Namespace, command: str) -> None:
     json_alone = options.json == "-"
     if not options.quiet:
         words = summary(report)
@@ -168,6 +170,8 @@ def _write(report: MatchReport, options: argparse.Namespace) -> None:
         Path(options.json).write_text(to_json(report) + "\n", encoding="utf-8")
     if options.npz:
         write_npz(options.npz, report)
+    if options.html:
+        write_html(options.html, report, command)
     if options.output and not cv2.imwrite(str(options.output), picture(report)):
         raise UsageError(f"{options.output}: cannot be written")
 
@@ -187,7 +191,7 @@ def main(arguments: Sequence[str]) -> int:
         quiet_codecs()
         _log_to_stderr(logging.ERROR if options.quiet else logging.DEBUG if options.verbose else logging.WARNING)
         report = _match(options)
-        _write(report, options)
+        _write(report, options, shlex.join(["mgca-match", *arguments]))
     except (UsageError, MgcaFilterError, ImportError, OSError, ValueError, TypeError) as error:
         print(f"mgca-match: {one_line(error)}", file=sys.stderr)
         return EXIT_USAGE

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..drawing import Image, MatchPanel, draw_matches
+from ..html_report import write_pair_report
 from ..match_images import ImageMatchResult
 from ..result import FilterResult, Status
 from .compare import BaselineFit, describe_rotation, describe_translation
@@ -194,3 +195,20 @@ def write_npz(path: Path, report: MatchReport) -> None:
     arrays.update({name: array for name, array in optional.items() if array is not None})
     with path.open("wb") as file:  # given a name, numpy would append .npz to it
         np.savez_compressed(file, **arrays)
+
+
+def write_html(path: Path, report: MatchReport, command: str) -> None:
+    """The report as one HTML file; ``command`` is what was run."""
+    write_pair_report(
+        path,
+        report.image1,
+        report.image2,
+        report.result,
+        name1=report.path1.name,
+        name2=report.path2.name,
+        baselines=report.baselines,
+        command=command,
+        K1=report.K1,
+        K2=report.K2,
+        matches=report.matched.matches,
+    )

@@ -35,7 +35,7 @@ NETWORK_ORDER = "network order"
 ANSWER_PACKAGES = ("fit", "geometry", "inference", "inputs", "network")
 """Folders of the package whose code decides what the filter answers."""
 
-OTHER_PACKAGES = ("cli", "data", "evaluation", "export", "pipelines", "opencv", "training")
+OTHER_PACKAGES = ("cli", "data", "evaluation", "export", "html_report", "pipelines", "opencv", "training")
 """Folders of the package that only ask for answers; a test holds both lists against the tree."""
 
 BEST_SHARE = 0.1

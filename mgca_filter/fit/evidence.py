@@ -22,11 +22,13 @@ RAW_MAX_RATIO = 0.9
 
 @dataclass(frozen=True)
 class Evidence:
-    """N distinct matches, the most promising first, each keypoint once in either image.
+    """N distinct matches, the most promising first.
 
     Attributes:
         rows: (N,) where each stands in the list that it comes from.
-        correspondences: (N, 4) on the normalised image planes, finite.
+        correspondences: (N, 4) on the normalised image planes, finite; sources sample from all of them.
+        once: (N,) bool, those whose keypoints stand in no better one: refinement and choice count these alone, since
+            several matches of one keypoint bear witness once.
         listed: (N,) bool, what a classical pipeline would fit to: all of a filtered list, of a raw one the best of
             the list with a ratio below 0.9.
         order: (N,) ascending = promising without a network: ratio or descriptor distance; NaN = unknown.
@@ -39,6 +41,7 @@ class Evidence:
 
     rows: NDArray[np.intp]
     correspondences: Array
+    once: NDArray[np.bool_]
     listed: NDArray[np.bool_]
     order: Array
     focal_px: float
@@ -77,10 +80,11 @@ def gather_before(pair: PairInput) -> Evidence:
     listed = listed_rows(pair.attributes, pair.valid)
     rows = np.flatnonzero(listed)
     rows = rows[np.argsort(np.nan_to_num(pair.order[rows], nan=np.inf), kind="stable")]
-    rows = one_to_one(pair.correspondences, rows)
+    rows = rows[np.sort(distinct_rows(pair.correspondences[rows]))]
     return Evidence(
         rows,
         np.ascontiguousarray(pair.correspondences[rows]),
+        one_to_one(pair.correspondences[rows]),
         np.ones(len(rows), dtype=bool),
         pair.order[rows],
         pair.focal_px,
@@ -104,10 +108,12 @@ def gather_scored(
     """
     attributes = pair.attributes[candidates]
     ratio, known = attributes[:, Column.RATIO], attributes[:, Column.RATIO_KNOWN] > 0
-    rows = one_to_one(pair.correspondences, candidates[match_order(margins[candidates], ratio, known)])
+    rows = candidates[match_order(margins[candidates], ratio, known)]
+    rows = rows[np.sort(distinct_rows(pair.correspondences[rows]))]
     return Evidence(
         rows,
         np.ascontiguousarray(pair.correspondences[rows]),
+        one_to_one(pair.correspondences[rows]),
         listed_rows(pair.attributes, pair.valid)[rows],
         pair.order[rows],
         pair.focal_px,
@@ -145,15 +151,14 @@ def match_order(
     return np.argsort(-quality, kind="stable")
 
 
-def one_to_one(correspondences: Array, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Of ``rows`` (K,), best first, those whose points in both images stand in no better one.
-
-    A match that is listed ten times is there once, and a keypoint that several matches reach for is in the best alone.
-    """
+def one_to_one(correspondences: Array) -> NDArray[np.bool_]:
+    """Of distinct matches (N, 4), best first, those (N,) whose points in either image stand in no better one."""
+    rows = np.arange(len(correspondences))
     for columns in (slice(0, 2), slice(2, 4)):
-        points = np.ascontiguousarray(correspondences[rows, columns])
-        rows = rows[np.sort(distinct_rows(points))]
-    return rows
+        rows = rows[np.sort(distinct_rows(correspondences[rows, columns]))]
+    chosen = np.zeros(len(correspondences), dtype=bool)
+    chosen[rows] = True
+    return chosen
 
 
 def distinct_rows(rows: Array) -> NDArray[np.intp]:

@@ -183,11 +183,13 @@ class Search:
 
     def _take(self, evidence: Evidence) -> None:
         self._evidence, self._judgement = evidence, None
+        self._judged = evidence.correspondences[evidence.once]
         fitted = evidence.listed
         if evidence.scores is not None:
             fitted = fitted | (evidence.scores > ACCEPTED_SCORE)
+        fitted = fitted & evidence.once
         enough = np.count_nonzero(fitted) >= MIN_MATCHES
-        self._fitted = evidence.correspondences[fitted] if enough else evidence.correspondences
+        self._fitted = evidence.correspondences[fitted] if enough else self._judged
 
     def _run(self, proposal: Proposal) -> list[Array]:
         """What a source proposes."""
@@ -264,8 +266,8 @@ class Search:
                 np.array([int(pose.family) for pose in self._poses]),
             )
             self._judgement = choice.judge(
-                evidence.correspondences,
-                evidence.scores,
+                self._judged,
+                None if evidence.scores is None else evidence.scores[evidence.once],
                 hypotheses,
                 evidence.focal_px,
                 _poses_of_network(evidence),
@@ -296,8 +298,8 @@ class Search:
         found = [(F, proposal.name) for proposal in wanted for F in self._run(proposal)]
         if not found:
             return None
-        distance = np.stack([sampson_distance(evidence.correspondences, F) for F, _ in found]) * evidence.focal_px
-        probability = choice.prior(np.asarray(evidence.scores), self._coefficients)
+        distance = np.stack([sampson_distance(self._judged, F) for F, _ in found]) * evidence.focal_px
+        probability = choice.prior(np.asarray(evidence.scores)[evidence.once], self._coefficients)
         residuals = Residuals(distance, np.zeros(distance.shape, dtype=bool))
         likelihood = choice.log_likelihoods(residuals, probability, self._coefficients)
         F, origin = found[int(np.argmax(likelihood[:, int(np.argmax(likelihood.max(axis=0)))]))]
