@@ -517,9 +517,8 @@ def _to_comparable_pixels(points1: Array, points2: Array) -> tuple[Array, Array]
 def _map_by_opencv(family: str, points1: Array, points2: Array) -> Array | None:
     """OpenCV's own map where ours is none."""
     usable = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
-    find: dict[str, Callable[..., Any]] = dict(
-        homography=_find_homography, affine=_estimate_affine, similarity=_estimate_similarity
-    )
+    find: dict[str, Callable[..., Any]] = {"homography": _find_homography}
+    find |= {"affine": _estimate_affine, "similarity": _estimate_similarity}
     try:
         M, _ = find[family](points1[usable], points2[usable], method=cv2.RANSAC)
     except cv2.error:
