@@ -312,7 +312,9 @@ def run_decision(pairs: int, detector: str, first_seed: int) -> None:
                 claimed += found.meaningful
                 right += found.meaningful and close
                 found_by_fit += close
-            spread = " ".join(f"{value:.1f}" for value in np.percentile(values, [0, 5, 25, 50, 75, 100]))
+            spread = " ".join(
+                f"{value:.1f}" for value in np.percentile(np.minimum(values, 99.0), [0, 5, 25, 50, 75, 100])
+            )
             share = [100 * count / pairs for count in (claimed, right, found_by_fit)]
             print(f"{kind:10s} {name:10s} claimed {share[0]:5.1f} right {share[1]:5.1f} "
                   f"(fit alone {share[2]:5.1f})  log10 NFA 0/5/25/50/75/100 %: {spread}", flush=True)  # fmt: skip
