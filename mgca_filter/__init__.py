@@ -11,7 +11,14 @@ from .inputs.pair import MatchPair
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
 from .match_images import ImageMatchResult, match_images
 from .opencv.patch import patch_cv2
-from .opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
+from .opencv.twins import (
+    estimateAffine2D,
+    estimateAffinePartial2D,
+    findEssentialMat,
+    findFundamentalMat,
+    findHomography,
+    matchMGCA,
+)
 from .result import FilterResult, Status
 
 __version__ = "0.1.0"
@@ -28,10 +35,13 @@ __all__ = [
     "ModelError",
     "Status",
     "__version__",
+    "estimateAffine2D",
+    "estimateAffinePartial2D",
     "filter_many",
     "filter_matches",
     "findEssentialMat",
     "findFundamentalMat",
+    "findHomography",
     "matchMGCA",
     "match_images",
     "model_path",

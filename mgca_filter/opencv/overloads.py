@@ -66,8 +66,8 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("cameraMatrix", "cameraMatrix1", "cameraMatrix2"), _is_matrix),
     **dict.fromkeys(("distCoeffs1", "distCoeffs2", "dist_coeff1", "dist_coeff2"), _is_coefficients),
     **dict.fromkeys(("focal", "prob", "threshold", "ransacReprojThreshold", "confidence"), _is_number),
-    **dict.fromkeys(("method", "maxIters"), _is_integer),
-    "mask": _is_mask,
+    **dict.fromkeys(("method", "maxIters", "refineIters"), _is_integer),
+    **dict.fromkeys(("mask", "inliers"), _is_mask),
     "params": lambda value: isinstance(value, cv2.UsacParams),
     "pp": _is_point,
 }

@@ -10,11 +10,21 @@ from typing import Any
 
 import cv2
 
-from .twins import findEssentialMat, findFundamentalMat, matchMGCA
+from .twins import (
+    estimateAffine2D,
+    estimateAffinePartial2D,
+    findEssentialMat,
+    findFundamentalMat,
+    findHomography,
+    matchMGCA,
+)
 
 TWINS: dict[str, Callable[..., Any]] = {
     "findEssentialMat": findEssentialMat,
     "findFundamentalMat": findFundamentalMat,
+    "findHomography": findHomography,
+    "estimateAffine2D": estimateAffine2D,
+    "estimateAffinePartial2D": estimateAffinePartial2D,
     "xfeatures2d.matchGMS": matchMGCA,
 }
 """What replaces which function of cv2, by its name below ``cv2``."""
@@ -26,7 +36,7 @@ _depth = 0
 
 @contextmanager
 def patch_cv2() -> Iterator[None]:
-    """Swap ``cv2.findEssentialMat``, ``cv2.findFundamentalMat`` and ``cv2.xfeatures2d.matchGMS`` for our twins.
+    """Swap OpenCV's robust two-view estimators and ``cv2.xfeatures2d.matchGMS``, see :data:`TWINS`, for our twins.
 
     The swap is seen by the whole process, all threads included, from the first of several overlapping or nested uses
     until the last one ends, by an exception or without. A name that other code has taken over by ``from cv2 import``

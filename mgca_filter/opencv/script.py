@@ -29,7 +29,7 @@ from ..match_filter import MatchFilter
 from .patch import TWINS, locate, swapped
 
 EXIT_USAGE = 2
-UNCOVERED = ("findHomography", "estimateAffine2D", "estimateAffinePartial2D", "recoverPose")
+UNCOVERED = ("recoverPose", "estimateTranslation2D")
 """OpenCV's other robust estimators between two images; ``recoverPose`` is one where it fits E itself."""
 
 
@@ -160,7 +160,8 @@ def run_script(path: Path, arguments: Sequence[str]) -> CallLog:
         if hasattr(module, attribute):
             recording[name] = log.recording(name, getattr(module, attribute), twin)
     for name in UNCOVERED:
-        recording[name] = log.counting(name, getattr(cv2, name))
+        if hasattr(cv2, name):  # estimateTranslation2D is of OpenCV 4.13
+            recording[name] = log.counting(name, getattr(cv2, name))
     sys.argv = [str(path), *arguments]
     sys.path.insert(0, str(path.resolve().parent))
     try:

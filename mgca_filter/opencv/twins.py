@@ -1,17 +1,20 @@
 """OpenCV's names, argument orders, defaults and return types over the filter.
 
-What OpenCV's arguments mean here, for :func:`findEssentialMat` and :func:`findFundamentalMat`:
+What OpenCV's arguments mean here, for :func:`findEssentialMat`, :func:`findFundamentalMat`, :func:`findHomography`,
+:func:`estimateAffine2D` and :func:`estimateAffinePartial2D`:
 
 - *points*: bare points are all that these functions get, so the network judges by position alone. A script that had
   ratios, keypoint sizes and angles before the call has lost them by then: :func:`mgca_filter.filter_matches` takes the
   keypoints and matches themselves and does markedly better. Points in units of the focal length (``cameraMatrix`` the
   identity, threshold 1e-3) are recognised by their size.
 - *method*: every robust method gives the filter's own fit, which asks MAGSAC and PROSAC among others and takes the most
-  likely answer. ``cv2.FM_7POINT`` and ``cv2.FM_8POINT`` ask for a solver, not for a filter: they go to OpenCV as they
-  are.
+  likely answer. ``cv2.FM_7POINT``, ``cv2.FM_8POINT`` and 0 for a homography ask for a solver, not for a filter: they go
+  to OpenCV as they are. ``cv2.LMEDS``, which knows no threshold, gets 0.3 % of the extent of the second points where it
+  estimates homographies, affine maps or similarities.
 - *prob*, *confidence*: probability that the robust fit has drawn a sample without outliers. *maxIters*: its samples.
-- *threshold*, *ransacReprojThreshold*: Sampson distance, pixels, up to which the mask calls a match an inlier. The fit
-  itself works at a threshold of its own.
+- *threshold*, *ransacReprojThreshold*: Sampson distance, pixels, up to which the mask calls a match an inlier; of
+  homographies, affine maps and similarities the transfer error in the second image, as in OpenCV. The fit itself works
+  at a threshold of its own.
 - *mask*: an output, as in OpenCV: an array uint8 (N, 1) passed in is written to; what it holds is not read.
 - *UsacParams*: ``confidence``, ``threshold``, ``maxIterations`` and ``randomGeneratorState`` as above; the rest is not
   used.
@@ -28,12 +31,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..fit.homography_fit import HomographyFit, HomographyOptions, estimate_homography
+from ..fit.planarity import MEANINGFUL_LOG10_NFA, homography_false_alarms
+from ..geometry.homography import scaled_homography, transfer
 from ..inputs.keypoints import read_keypoints
 from ..inputs.options import FilterOptions, check_integer, check_number
 from ..inputs.pair import MatchPair
@@ -50,7 +57,23 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _SOLVERS = (cv2.FM_7POINT, cv2.FM_8POINT)
 # Bound at import, like those of the robust fit: the names in cv2 may be swapped.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
+_find_homography = cv2.findHomography
+_estimate_affine, _estimate_similarity = cv2.estimateAffine2D, cv2.estimateAffinePartial2D
 
+# Points of a map that extend over less than this are normalised; an image of this many pixels stands in for theirs.
+_FEWEST_PIXELS, _USUAL_PIXELS = 10.0, 1000.0
+# One plane's unit may be metres where the other's is pixels: a larger ratio of their extents is no zoom.
+_LARGEST_ZOOM = 8.0
+# LMedS knows no threshold: this share of the extent of the second points takes its place.
+_LMEDS_THRESHOLD_SHARE = 3e-3
+# The fit starts at this transfer error, pixels, or at the caller's threshold where that is smaller.
+_MAP_FIT_THRESHOLD_PX = 3.0
+# Where fewer of the matches that the caller's threshold admits lie within the fit's own, they are coarse.
+_SHARP_SHARE = 0.7
+_ROBUST_METHODS = (
+    cv2.RANSAC, cv2.LMEDS, cv2.RHO, cv2.USAC_DEFAULT, cv2.USAC_PARALLEL, cv2.USAC_FM_8PTS, cv2.USAC_FAST,
+    cv2.USAC_ACCURATE, cv2.USAC_PROSAC, cv2.USAC_MAGSAC,
+)  # fmt: skip
 
 _log = logging.getLogger("mgca_filter")
 
@@ -105,6 +128,66 @@ def findFundamentalMat(*args: Any, **kwargs: Any) -> Answer:
         TypeError: the arguments fit no overload. ValueError: one has another shape.
     """
     result: Answer = call_overload("findFundamentalMat", _FUNDAMENTAL_OVERLOADS, args, kwargs)
+    return result
+
+
+@_typed_like(cv2.findHomography)
+def findHomography(*args: Any, **kwargs: Any) -> Answer:
+    """Homography and inlier mask, ``cv2.findHomography`` in all its overloads.
+
+    ::
+
+        findHomography(srcPoints, dstPoints[, method[, ransacReprojThreshold[, mask[, maxIters[, confidence]]]]])
+        findHomography(srcPoints, dstPoints, params[, mask])
+
+    Method 0 (least squares), points in three coordinates and fewer than five points go to OpenCV as they are. As
+    OpenCV does, a threshold that is not positive becomes 3; it is the transfer error in the second image up to which
+    the mask calls a match an inlier.
+
+    Returns:
+        H (3, 3) float64 with H[2, 2] = 1, ``p2 ~ H p1``, or None where OpenCV finds none either; and the mask (N, 1)
+        uint8, all zero where the support of H is no more than chance gives.
+
+    Raises:
+        TypeError: the arguments fit no overload. ValueError: one has another shape or range. cv2.error: what OpenCV
+        says of the calls that go to it.
+    """
+    result: Answer = call_overload("findHomography", _HOMOGRAPHY_OVERLOADS, args, kwargs)
+    return result
+
+
+@_typed_like(cv2.estimateAffine2D)
+def estimateAffine2D(*args: Any, **kwargs: Any) -> Answer:
+    """Affine map and inlier mask, ``cv2.estimateAffine2D`` in all its overloads.
+
+    ::
+
+        estimateAffine2D(from_, to[, inliers[, method[, ransacReprojThreshold[, maxIters[, confidence
+                         [, refineIters]]]]]])
+        estimateAffine2D(pts1, pts2, params[, inliers])
+
+    Fewer than four points go to OpenCV as they are; ``refineIters`` has no effect, for the fit always refines.
+
+    Returns:
+        The map (2, 3) float64, or None where OpenCV finds none either; and the mask (N, 1), as in
+        :func:`findHomography`, whose errors are these functions', too.
+    """
+    result: Answer = call_overload("estimateAffine2D", _AFFINE_OVERLOADS, args, kwargs)
+    return result
+
+
+@_typed_like(cv2.estimateAffinePartial2D)
+def estimateAffinePartial2D(*args: Any, **kwargs: Any) -> Answer:
+    """Similarity and inlier mask, ``cv2.estimateAffinePartial2D``; as :func:`estimateAffine2D`.
+
+    ::
+
+        estimateAffinePartial2D(from_, to[, inliers[, method[, ransacReprojThreshold[, maxIters[, confidence
+                                [, refineIters]]]]]])
+
+    Fewer than three points go to OpenCV as they are.
+    """
+    result: Answer = call_overload("estimateAffinePartial2D", _SIMILARITY_OVERLOADS, args, kwargs)
     return result
 
 
@@ -228,6 +311,84 @@ def _fundamental_by_params(points1: Any, points2: Any, params: cv2.UsacParams, m
     return _fit_fundamental(points1, points2, _read_params(params), mask)
 
 
+def _homography_of_points(
+    srcPoints: Any,
+    dstPoints: Any,
+    method: int = 0,
+    ransacReprojThreshold: float = 3.0,
+    mask: Any = None,
+    maxIters: int = 2000,
+    confidence: float = 0.995,
+) -> Answer:
+    if method not in _ROBUST_METHODS or _is_opencvs_own(srcPoints, dstPoints, 5):
+        limits = (ransacReprojThreshold, mask, maxIters, confidence)
+        return _with_mask(_find_homography(srcPoints, dstPoints, method, *limits), srcPoints)
+    threshold = ransacReprojThreshold if ransacReprojThreshold > 0 else 3.0
+    options = _read_fit(confidence, threshold, maxIters)
+    return _fit_map("homography", srcPoints, dstPoints, options, method == cv2.LMEDS, mask)
+
+
+def _homography_by_params(srcPoints: Any, dstPoints: Any, params: cv2.UsacParams, mask: Any = None) -> Answer:
+    if _is_opencvs_own(srcPoints, dstPoints, 5):
+        return _with_mask(_find_homography(srcPoints, dstPoints, params, mask), srcPoints)
+    return _fit_map("homography", srcPoints, dstPoints, _read_params(params), False, mask)
+
+
+def _affine_of_points(
+    from_: Any,
+    to: Any,
+    inliers: Any = None,
+    method: int = cv2.RANSAC,
+    ransacReprojThreshold: float = 3.0,
+    maxIters: int = 2000,
+    confidence: float = 0.99,
+    refineIters: int = 10,
+) -> Answer:
+    if method not in _ROBUST_METHODS or _is_opencvs_own(from_, to, 4):
+        limits = (ransacReprojThreshold, maxIters, confidence, refineIters)
+        return _with_mask(_estimate_affine(from_, to, inliers, method, *limits), from_)
+    options = _read_fit(confidence, ransacReprojThreshold, maxIters)
+    return _fit_map("affine", from_, to, options, method == cv2.LMEDS, inliers)
+
+
+def _affine_by_params(pts1: Any, pts2: Any, params: cv2.UsacParams, inliers: Any = None) -> Answer:
+    if _is_opencvs_own(pts1, pts2, 4):
+        return _with_mask(_estimate_affine(pts1, pts2, params, inliers), pts1)
+    return _fit_map("affine", pts1, pts2, _read_params(params), False, inliers)
+
+
+def _similarity_of_points(
+    from_: Any,
+    to: Any,
+    inliers: Any = None,
+    method: int = cv2.RANSAC,
+    ransacReprojThreshold: float = 3.0,
+    maxIters: int = 2000,
+    confidence: float = 0.99,
+    refineIters: int = 10,
+) -> Answer:
+    if method not in _ROBUST_METHODS or _is_opencvs_own(from_, to, 3):
+        limits = (ransacReprojThreshold, maxIters, confidence, refineIters)
+        return _with_mask(_estimate_similarity(from_, to, inliers, method, *limits), from_)
+    options = _read_fit(confidence, ransacReprojThreshold, maxIters)
+    return _fit_map("similarity", from_, to, options, method == cv2.LMEDS, inliers)
+
+
+def _is_opencvs_own(points1: Any, points2: Any, fewest: int) -> bool:
+    """True for points that are fewer than ``fewest``, or in three coordinates."""
+    shapes = [np.shape(points) for points in (points1, points2)]
+    return any(len(shape) > 1 and shape[-1] == 3 and 2 not in shape for shape in shapes) or any(
+        int(np.prod(shape)) < 2 * fewest for shape in shapes
+    )
+
+
+def _with_mask(answer: tuple[Any, Any], points: Any) -> Answer:
+    """OpenCV's answer with a mask in any case."""
+    M, mask = answer
+    count = max(np.shape(points)[:2])
+    return M, np.zeros((count, 1), np.uint8) if mask is None else mask
+
+
 def _read_fit(confidence: float, threshold: float, max_iterations: int, seed: int = 0) -> FilterOptions:
     """Options of the filter from OpenCV's scalar arguments; the threshold stays in the unit of the points.
 
@@ -268,6 +429,83 @@ def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: A
     result = _run(MatchPair(points1, points2, None), options, "findFundamentalMat")
     F = result.F if result.F is not None else _find_by_opencv(_find_fundamental_mat, points1, points2)
     return _scaled(F), _as_opencv_mask(result.mask, mask)
+
+
+@np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
+def _fit_map(family: str, points1: Any, points2: Any, options: FilterOptions, lmeds: bool, mask: Any) -> Answer:
+    """A map of a family, (3, 3) or (2, 3), or None where nothing can be found, and the mask (N, 1)."""
+    points1, points2 = _read_points(points1, points2)
+    T1, T2 = _to_comparable_pixels(points1, points2)
+    threshold = options.threshold * T2[0, 0]
+    x1, x2 = transfer(points1, T1), transfer(points2, T2)
+    if lmeds:
+        threshold = max(_LMEDS_THRESHOLD_SHARE * _extent(x2), np.finfo(np.float64).tiny)
+    scored = _run(MatchPair(x1, x2, None), replace(options, threshold=1.0, method="none"), family)
+    found = _fit_in_pixels(family, np.hstack([x1, x2]), scored.scores.astype(np.float64), threshold, options)
+    if found is None:
+        return _map_by_opencv(family, points1, points2), _as_opencv_mask(np.zeros(len(points1), dtype=bool), mask)
+    fit, meaningful = found
+    distance = np.linalg.norm(transfer(x1, fit.H) - x2, axis=1)
+    inlier = (distance < threshold) & np.isfinite(fit.distance) & meaningful
+    H = scaled_homography(np.linalg.inv(T2) @ fit.H @ T1)
+    return H if family == "homography" else H[:2], _as_opencv_mask(inlier, mask)
+
+
+def _fit_in_pixels(
+    family: str, rows: Array, scores: Array, threshold: float, options: FilterOptions
+) -> tuple[HomographyFit, bool] | None:
+    """The fit to matches (N, 4) in pixels, and whether its support is more than chance; None where there is none.
+
+    At a threshold of the fit's own first, for callers are generous; at theirs as well where the first finds nothing
+    or where the matches that theirs admits spread beyond it, and the one that more matches agree with is kept.
+    """
+    order = np.argsort(-scores, kind="stable")
+    usable = order[np.isfinite(rows[order]).all(axis=1)]
+    best: tuple[int, HomographyFit, bool] | None = None
+    for transfer_error in dict.fromkeys((min(threshold, _MAP_FIT_THRESHOLD_PX), threshold)):
+        fit_options = HomographyOptions(
+            threshold=transfer_error / np.sqrt(2.0),
+            family=family,
+            confidence=options.confidence,
+            max_iterations=options.max_iterations,
+            seed=options.seed,
+            reflection=True,
+        )
+        fit = estimate_homography(rows, fit_options, scores, order)
+        if fit is None:
+            continue
+        log10_nfa = homography_false_alarms(rows[usable], fit.H, fit_options.threshold, family=family)
+        meaningful = log10_nfa < MEANINGFUL_LOG10_NFA
+        admitted = int(np.count_nonzero(fit.distance < threshold / np.sqrt(2.0)))
+        if best is None or (meaningful, admitted) > (best[2], best[0]):
+            best = admitted, fit, meaningful
+        if meaningful and np.count_nonzero(fit.inlier) > _SHARP_SHARE * admitted:
+            break
+    return None if best is None else best[1:]
+
+
+def _to_comparable_pixels(points1: Array, points2: Array) -> tuple[Array, Array]:
+    """Scales (3, 3) of both point sets that make numbers of pixels of them.
+
+    The second's is 1 but for normalised points, and so is the first's unless its unit is another than the second's.
+    """
+    extents = [max(_extent(points), np.finfo(np.float64).tiny) for points in (points1, points2)]
+    zoom2 = _USUAL_PIXELS / extents[1] if extents[1] < _FEWEST_PIXELS else 1.0
+    ratio = extents[0] / (extents[1] * zoom2)
+    zoom1 = 1.0 / ratio if not 1.0 / _LARGEST_ZOOM < ratio < _LARGEST_ZOOM else 1.0
+    return np.diag([zoom1, zoom1, 1.0]), np.diag([zoom2, zoom2, 1.0])
+
+
+def _map_by_opencv(family: str, points1: Array, points2: Array) -> Array | None:
+    """OpenCV's own map where ours is none."""
+    usable = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
+    find: dict[str, Callable[..., Any]] = {"homography": _find_homography}
+    find |= {"affine": _estimate_affine, "similarity": _estimate_similarity}
+    try:
+        M, _ = find[family](points1[usable], points2[usable], method=cv2.RANSAC)
+    except cv2.error:
+        return None
+    return None if M is None or np.size(M) == 0 or not np.isfinite(M).all() else np.asarray(M, dtype=np.float64)
 
 
 def _find_by_opencv(function: Callable[..., Any], points1: Array, points2: Array, *arguments: Any) -> Array | None:
@@ -314,6 +552,12 @@ def _coefficients(dist: Any) -> Any:
     return None if dist is None or np.size(dist) == 0 else dist
 
 
+def _extent(points: Array) -> float:
+    """The longer side of the box around the finite points (N, 2)."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+
+
 def _scaled(F: Array | None) -> Array | None:
     """OpenCV's scale: F[2, 2] = 1, where it is not zero."""
     if F is None:
@@ -338,3 +582,6 @@ _ESSENTIAL_OVERLOADS = (
     _essential_by_params,
 )
 _FUNDAMENTAL_OVERLOADS = (_fundamental_with_limit, _fundamental_of_points, _fundamental_by_params)
+_HOMOGRAPHY_OVERLOADS = (_homography_of_points, _homography_by_params)
+_AFFINE_OVERLOADS = (_affine_of_points, _affine_by_params)
+_SIMILARITY_OVERLOADS = (_similarity_of_points,)

@@ -17,7 +17,16 @@ from conftest import SIZE, K, Scene, make_scene
 import mgca_filter
 from mgca_filter import Status, filter_matches, findEssentialMat, findFundamentalMat, matchMGCA, patch_cv2
 from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg, sampson_distance
-from mgca_filter.opencv.twins import _ESSENTIAL_OVERLOADS, _FUNDAMENTAL_OVERLOADS
+from mgca_filter.opencv.twins import (
+    _AFFINE_OVERLOADS,
+    _ESSENTIAL_OVERLOADS,
+    _FUNDAMENTAL_OVERLOADS,
+    _HOMOGRAPHY_OVERLOADS,
+    _SIMILARITY_OVERLOADS,
+    estimateAffine2D,
+    estimateAffinePartial2D,
+    findHomography,
+)
 
 TWINS = {"E": lambda p1, p2: findEssentialMat(p1, p2, K), "F": findFundamentalMat}
 
@@ -38,6 +47,9 @@ def forms(function: Callable[..., Any]) -> list[list[str]]:
     [
         (cv2.findEssentialMat, _ESSENTIAL_OVERLOADS),
         (cv2.findFundamentalMat, _FUNDAMENTAL_OVERLOADS),
+        (cv2.findHomography, _HOMOGRAPHY_OVERLOADS),
+        (cv2.estimateAffine2D, _AFFINE_OVERLOADS),
+        (cv2.estimateAffinePartial2D, _SIMILARITY_OVERLOADS),
         (cv2.xfeatures2d.matchGMS, [matchMGCA]),
     ],
 )
@@ -322,7 +334,14 @@ def test_match_mgca_returns_the_kept_matches(scene: Scene) -> None:
 
 
 def originals() -> tuple[Callable, ...]:
-    return cv2.findEssentialMat, cv2.findFundamentalMat, cv2.xfeatures2d.matchGMS
+    return (
+        cv2.findEssentialMat,
+        cv2.findFundamentalMat,
+        cv2.findHomography,
+        cv2.estimateAffine2D,
+        cv2.estimateAffinePartial2D,
+        cv2.xfeatures2d.matchGMS,
+    )
 
 
 OPENCV = originals()
@@ -336,7 +355,14 @@ def _opencv_is_itself_again() -> Iterator[None]:
 
 def test_patch_swaps_and_restores(scene: Scene) -> None:
     with patch_cv2():
-        assert originals() == (findEssentialMat, findFundamentalMat, matchMGCA)
+        assert originals() == (
+            findEssentialMat,
+            findFundamentalMat,
+            findHomography,
+            estimateAffine2D,
+            estimateAffinePartial2D,
+            matchMGCA,
+        )
         E, _ = cv2.findEssentialMat(scene.points1, scene.points2, K)
     np.testing.assert_array_equal(E, findEssentialMat(scene.points1, scene.points2, K)[0])
     assert originals() == OPENCV
