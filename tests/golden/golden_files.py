@@ -1,0 +1,131 @@
+"""The golden files: what goes into the filter and what it answers, readable from Python and C++."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import mgca_filter
+from mgca_filter import FilterResult
+from mgca_filter.inputs.attributes import MatchAttributes
+
+FOLDER = Path(__file__).parent
+_DECIMALS = 5
+
+
+@dataclass(frozen=True)
+class GoldenInput:
+    """One pair.
+
+    Attributes:
+        name: of the file.
+        keypoints1, keypoints2: rows (x, y, size, angle) of ``cv2.KeyPoint``, or (x, y) of bare points; null = not finite.
+        matches: rows (query, train), (query, train, distance) or (…, second distance), or empty; None = row i matches
+            row i.
+        K1, K2, dist1, dist2, size1, size2, attributes: as the arguments of the filter.
+    """
+
+    name: str
+    keypoints1: list[list[float | None]]
+    keypoints2: list[list[float | None]]
+    matches: list[list[float | None]] | None
+    K1: list[list[float]] | None = None
+    K2: list[list[float]] | None = None
+    dist1: list[float] | None = None
+    dist2: list[float] | None = None
+    size1: list[float] | None = None
+    size2: list[float] | None = None
+    attributes: dict[str, list[Any]] | None = None
+
+    @classmethod
+    def read(cls, path: Path) -> GoldenInput:
+        return cls(**json.loads(path.read_text(encoding="utf-8")))
+
+    def arguments(self) -> dict[str, Any]:
+        """The arguments of :func:`mgca_filter.filter_matches`."""
+        known = None
+        if self.attributes is not None:
+            kinds = {"best": np.bool_}
+            known = MatchAttributes(
+                **{name: np.array(v, dtype=kinds.get(name, np.float32)) for name, v in self.attributes.items()}
+            )
+        cameras = {name: getattr(self, name) for name in ("K1", "K2", "dist1", "dist2", "size1", "size2")}
+        arrays = {name: None if value is None else np.array(value, float) for name, value in cameras.items()}
+        return {
+            "kp1": _keypoints(self.keypoints1),
+            "kp2": _keypoints(self.keypoints2),
+            "matches": _matches(self.matches),
+            "attributes": known,
+            **arrays,
+        }
+
+
+@dataclass(frozen=True)
+class Case:
+    """An input with options of the filter."""
+
+    name: str
+    input: str
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def _keypoints(rows: list[list[float | None]]) -> Any:
+    values = np.array([[np.nan if x is None else x for x in row] for row in rows], dtype=float).reshape(len(rows), -1)
+    if values.shape[1] == 2:
+        return values
+    return [cv2.KeyPoint(float(x), float(y), float(size), float(angle)) for x, y, size, angle in values]
+
+
+def _matches(rows: list[list[Any]] | None) -> Any:
+    if rows is None:
+        return None
+    if not rows:
+        return []
+    longest = max(len(row) for row in rows)
+    if longest == 2:
+        return np.array(rows, dtype=np.intp)
+    if longest == 3:
+        return [cv2.DMatch(*row) for row in rows]
+    knn = []
+    for row in rows:
+        first = [cv2.DMatch(row[0], row[1], row[2])] if row else []
+        knn.append(first + ([cv2.DMatch(row[0], 0, row[3])] if len(row) == 4 else []))
+    return knn
+
+
+def run_case(case: Case, golden: GoldenInput) -> dict[str, Any]:
+    """The filter's answer with the shipped model, ready for JSON."""
+    return describe(mgca_filter.filter_matches(**golden.arguments(), **case.options))
+
+
+def describe(result: FilterResult) -> dict[str, Any]:
+    """A result as the golden files hold it."""
+
+    def numbers(value: Any) -> list[float] | None:
+        return None if value is None else [float(f"{x:.12g}") for x in np.ravel(value)]
+
+    return {
+        "opencv": cv2.__version__,
+        "status": str(result.status),
+        "confidence": None if result.confidence is None else round(result.confidence, _DECIMALS),
+        "mask": "".join("01"[int(kept)] for kept in result.mask),
+        "scores": [round(float(score), _DECIMALS) for score in result.scores],
+        "logits": [round(float(logit), _DECIMALS) for logit in result.info["logits"]],
+        "E": numbers(result.E),
+        "F": numbers(result.F),
+        "R": numbers(result.R),
+        "t": numbers(result.t),
+        "H": numbers(getattr(result, "H", None) if hasattr(result, "H") else result.info.get("homography")),
+        "origin": result.info["origin"],
+        "ended": result.info["ended"],
+        "num_network_matches": result.info["num_network_matches"],
+        "intrinsics": result.info["intrinsics"],
+        "assumptions": result.info["assumptions"],
+        "support": result.info.get("support"),
+        "focal_factor": result.info.get("focal_factor"),
+    }
