@@ -1,9 +1,9 @@
 """Choice among hypotheses, and the confidence of what was chosen.
 
 The choice is the likelihood of the matches, each of which is right with a probability that its score gives, and then
-lies about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and anywhere.
-On long lists matches are far from independent and the likelihood is too sure of itself: there the support, summed scores
-of the matches near by, counts the more, the longer the list is.
+lies about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and
+anywhere. On long lists matches are far from independent and the likelihood is too sure of itself: there the support,
+the summed scores of the matches near by, counts the more, the longer the list is.
 The confidence is a logistic regression on measurements of the chosen hypothesis: how much of the list it explains, how
 far the best *other* answer falls behind, which unlike sources found the same, how firmly its inliers hold it. All
 hypotheses are measured on all distinct matches in one vectorised pass. The numbers are data, a dict of lists of floats,
