@@ -38,6 +38,7 @@ LEAST_NOISE_PX = 0.1
 _TO_SIGMA = 1.4826
 # A match this many sigmas off counts no more than that.
 _GRIC_CUT = 5.0
+_PRICE_OF_DIMENSION = 2.2
 _CHANCE_ROWS = 400
 _TRIM_ROUNDS = 5
 _MODEL_FREEDOM = 5
@@ -141,7 +142,8 @@ def prefers_rotation(rotation_px: Array, epipolar_px: Array) -> bool:
     noise = max(_TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
     # Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
     costs = [float(np.minimum((d / noise) ** 2, _GRIC_CUT**2).sum()) for d in (rotation_px, epipolar_px)]
-    price = log(4.0) * count + 2.0 * log(4.0 * count)
+    # Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
+    price = _PRICE_OF_DIMENSION * count + 2.0 * log(4.0 * count)
     return costs[0] - costs[1] < price
 
 

@@ -104,7 +104,9 @@ def judge(
     if suspicious:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
     if doubtful:
-        return _plane_or(replace(verdict, status=Status.LOW_SUPPORT), pair, evidence, mask_threshold_px, options)
+        plane = _plane_or(verdict, pair, evidence, mask_threshold_px, options)
+        info = {**info, "homography": plane.H} if plane.H is not None else info
+        return replace(verdict, status=Status.LOW_SUPPORT, H=plane.H, info=info)
     factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
     if factor is not None:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
@@ -199,7 +201,8 @@ def _test_rotation(
     """The verdict where a rotation alone explains as many matches, so that they say nothing of a translation.
 
     Args:
-        fitted_rows: (N,) rows of the pair's matches that bear witness. near: (N,) bool, those that agree with the model.
+        fitted_rows: (N,) rows of the pair's matches that bear witness.
+        near: (N,) bool, those of them that agree with the model.
     """
     R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
     H = pair.intrinsics2.K @ R @ np.linalg.inv(pair.intrinsics1.K)
