@@ -86,6 +86,18 @@ class PairInput:
         """Mean focal length in pixels."""
         return mean_focal_length(self.intrinsics1.K, self.intrinsics2.K)
 
+    def with_focal(self, factor: float) -> PairInput:
+        """The pair under the guessed focal length times ``factor``, taken for the truth from now on."""
+        zoom = np.diag([factor, factor, 1.0])
+        cameras = []
+        for camera in (self.intrinsics1, self.intrinsics2):
+            K = camera.K.copy()
+            K[:2, :2] = K[:2, :2] @ zoom[:2, :2]
+            cameras.append(replace(camera, K=K, guessed=False))
+        return replace(
+            self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
+        )
+
     def threshold_px(self, threshold: float) -> float:
         """The caller's threshold in pixels."""
         return threshold if threshold > self.largest_threshold else threshold * self.unit_px
