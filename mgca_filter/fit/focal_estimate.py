@@ -82,7 +82,7 @@ def estimate_focal(evidence: Evidence, F: Array) -> FocalEstimate | None:
 
 
 def _cost_px(rows: Array, F: Array, factor: float, focal_px: float) -> float:
-    """Summed truncated squared Sampson errors, px², of the best pose under the guessed focal length times ``factor``."""
+    """Truncated squared Sampson errors in px², summed, of the best pose under ``factor`` times the guess."""
     zoom = np.diag([factor, factor, 1.0])
     scaled, focal = rows / factor, focal_px * factor
     pose = pose_from_essential(project_to_essential(zoom @ F @ zoom), scaled, focal / _REACH_PX)
