@@ -183,6 +183,7 @@ class MatchFilter:
         if job.model is None:
             logits, scores = self._score(job)
             self._fit(job, logits, scores)
+            pair = job.pair  # under another focal length now, where that was estimated
         else:
             logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
