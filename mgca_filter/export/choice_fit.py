@@ -239,7 +239,7 @@ def save_samples(path: Path, samples: Sequence[Sample]) -> None:
     width = len(FEATURES)
     features = np.stack([np.pad(sample.features, (0, width - len(sample.features))) for sample in samples])
     facts = {name: np.array([getattr(sample, name) for sample in samples]) for name in ("right", "group", "early")}
-    np.savez_compressed(path, features=features, **facts)
+    np.savez_compressed(path, features=features, **facts)  # type: ignore[arg-type]  # its stub takes names for options
 
 
 def load_samples(path: Path) -> list[Sample]:
