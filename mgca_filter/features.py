@@ -210,7 +210,7 @@ def match_features(features1: ImageFeatures, features2: ImageFeatures) -> OneWay
     Raises:
         ValueError: an image has no descriptors, or the two images' differ in dtype or length.
     """
-    descriptors1, descriptors2 = _described(features1), _described(features2)
+    descriptors1, descriptors2 = descriptors_of(features1), descriptors_of(features2)
     count1, count2 = len(features1), len(features2)
     forth = read_matches(match_descriptors(descriptors1, descriptors2), count1, count2)
     back = read_matches(match_descriptors(descriptors2, descriptors1), count2, count1)
@@ -273,7 +273,12 @@ def descriptor_distances(
     return np.sqrt(np.maximum(matched, 0.0)), np.sqrt(np.maximum(other, 0.0))
 
 
-def _described(features: ImageFeatures) -> NDArray[Any]:
+def descriptors_of(features: ImageFeatures) -> NDArray[Any]:
+    """Descriptors (N, D) of an image.
+
+    Raises:
+        ValueError: it has none.
+    """
     if features.descriptors is None:
         raise ValueError("no matches, and no descriptors to find them with")
     return features.descriptors

@@ -21,9 +21,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from .journal import Journal, PipelineError, output_file
 from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow, Unusable
+from .worker import PairRow, Unusable
 
 HALF_PIXEL = 0.5
 # COLMAP's own guess for a camera of which nothing is known.

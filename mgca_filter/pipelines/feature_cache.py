@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from ..features import ImageFeatures
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
-from .worker import ImageFeatures
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from ..images import intrinsics_doubts
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
 from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow, Unusable
+from .worker import PairRow, Unusable
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".jp2"))
@@ -171,9 +172,9 @@ class FolderJob:
 def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) -> None:
     """One JSON object per pair, in the order of the names.
 
-    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``E``, ``F``, ``H``,
-    ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and ``scores`` (K,)
-    of the kept matches, ``message`` for a pair that failed.
+    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``, ``E``,
+    ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
+    ``scores`` (K,) of the kept matches, ``message`` for a pair that failed.
     """
     with path.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(document, allow_nan=False) + "\n" for document in _documents(read, rows))
@@ -190,6 +191,7 @@ def _documents(read: ReadFeatures, rows: Iterable[PairRow]) -> Iterator[dict[str
             "num_matches": row.num_matches,
             "num_inliers": len(row.kept),
             "calibrated": row.calibrated,
+            "confidence": row.confidence,
             **{name: None if matrix is None else matrix.tolist() for name, matrix in matrices.items()},
             "points1": [] if image1 is None else image1.points[row.kept[:, 0]].tolist(),
             "points2": [] if image2 is None else image2.points[row.kept[:, 1]].tolist(),

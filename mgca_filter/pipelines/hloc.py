@@ -20,9 +20,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from .journal import Journal, PipelineError, file_stamp, output_file
 from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import FAILED, ImageFeatures, PairRow, Unusable
+from .worker import FAILED, PairRow, Unusable
 
 _SIFT_LENGTH = 128
 

@@ -20,13 +20,13 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from .. import __version__
+from ..features import ImageFeatures
 from ..inference.model_file import sha256_of
 from ..match_filter import MatchFilter, model_path
 from .journal import Journal, PipelineError
 from .worker import (
     EXPLAINED,
     FAILED,
-    ImageFeatures,
     Unusable,
     call_worker,
     call_worker_process,

@@ -48,8 +48,9 @@ def test_rows_equal_match_images(image_folder, views, expected):
     assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
     for row in rows:
         view1, view2 = (next(v for v in views if v.name == row[key]) for key in ("image1", "image2"))
-        alone = match_images(view1.image, view2.image, K1=view1.K)
+        alone = match_images(view1.image, view2.image, K1=view1.K, method="prosac")
         assert row["status"] == alone.result.status.value
+        assert row["confidence"] == alone.result.confidence
         assert row["num_inliers"] == alone.result.num_inliers == len(row["points1"]) == len(row["scores"])
         np.testing.assert_allclose(row["R"], alone.result.R, atol=1e-9)
         R = view2.R @ view1.R.T
