@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..features import ImageFeatures
 from .journal import Journal, PipelineError, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
 from .worker import PairRow, Unusable
 
 HALF_PIXEL = 0.5
@@ -52,11 +52,13 @@ class ColmapJob:
         database: read, and changed only where ``output`` is the same path.
         output: gets everything that ``database`` holds, with our ``two_view_geometries``.
         use_descriptors: compute each match's distance ratio from SIFT descriptors where the database holds them.
+        report: an HTML report of the run, or None.
     """
 
     database: Path
     output: Path
     use_descriptors: bool = True
+    report: Report | None = None
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
@@ -81,6 +83,8 @@ class ColmapJob:
                 summary = run_pairs(source, workers, journal, quiet)
                 write_geometries(database, source.ids, journal.rows())
             self._deliver(copy)
+            if self.report is not None:
+                self.report.write(journal.rows())
         finally:
             journal.close()
         shutil.rmtree(work)

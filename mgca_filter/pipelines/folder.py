@@ -17,7 +17,7 @@ from ..features import ImageFeatures
 from ..images import intrinsics_doubts
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
 from .worker import PairRow, Unusable
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
@@ -117,6 +117,7 @@ class FolderJob:
         K: (3, 3) intrinsics that all images share, in pixels, or None: the focal length is guessed.
         detector, max_keypoints: as in :func:`mgca_filter.match_images`.
         cache: folder that keeps the features for other runs, or None: beside the output until the run is done.
+        report: an HTML report of the run, or None.
     """
 
     images: Path
@@ -126,6 +127,7 @@ class FolderJob:
     detector: str = "sift"
     max_keypoints: int = 2000
     cache: Path | None = None
+    report: Report | None = None
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Extract what the cache lacks, filter all pairs, write the output; a killed run goes on where it stopped.
@@ -145,15 +147,20 @@ class FolderJob:
             cache.fill(names, workers, quiet)
             source = FolderSource(cache, self.pairs, self.K)
             summary = run_pairs(source, workers, journal, quiet)
-            self._write(names, cache.read, journal)
+            self._write(names, cache.read, self._rows(journal))
+            if self.report is not None:
+                self.report.write(self._rows(journal))
         finally:
             journal.close()
         shutil.rmtree(work)
         return summary if self.K is None else replace(summary, doubts=intrinsics_doubts(self.K, source.sizes))
 
-    def _write(self, names: Sequence[str], read: ReadFeatures, journal: Journal) -> None:
+    def _rows(self, journal: Journal) -> Iterator[PairRow]:
+        """Rows of the pairs that are asked for; a run that was killed may have been asked for others."""
         wanted = set(self.pairs)
-        rows = (row for row in journal.rows() if (row.name1, row.name2) in wanted)
+        return (row for row in journal.rows() if (row.name1, row.name2) in wanted)
+
+    def _write(self, names: Sequence[str], read: ReadFeatures, rows: Iterable[PairRow]) -> None:
         with output_file(self.output) as partial:
             if self.output.suffix == ".db":
                 from .colmap import write_database

@@ -18,6 +18,7 @@ from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.geometry.epipolar import pose_error_deg
+from mgca_filter.html_report import write_folder_report
 from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
@@ -318,3 +319,35 @@ def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path
     assert 0 < sure["num_inliers"] != first["num_inliers"]
     assert run(image_folder, tmp_path / "cpu.jsonl", *few, "--providers", "CPUExecutionProvider") == 0
     assert read_rows(tmp_path / "cpu.jsonl")[0] == first
+
+
+def test_the_report_is_about_the_rows(image_folder, tmp_path, monkeypatch):
+    from mgca_filter.pipelines import run as run_module
+
+    written = []
+
+    def write_and_note(path, lines, **words):
+        lines = list(lines)
+        written.append((lines, words))
+        return write_folder_report(path, lines, **words)
+
+    monkeypatch.setattr(run_module, "write_folder_report", write_and_note)
+    (image_folder / "broken.jpg").write_bytes(b"no image")
+    output, page = tmp_path / "out.jsonl", tmp_path / "report.html"
+    assert run(image_folder, output, "--html", page) == 0
+    ((lines, words),) = written
+    keys = ("image1", "image2", "status", "num_matches", "num_inliers", "confidence")
+    assert [tuple(line) for line in lines] == [tuple(row[key] for key in keys) for row in read_rows(output)]
+    assert {line.status for line in lines} >= {"ok", "failed"}
+    assert words["title"] == "images"
+    assert words["command"].startswith("mgca-match folder ")
+    assert page.read_text(encoding="utf-8").startswith("<!")
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(image_folder, tmp_path, capsys):
+    output = tmp_path / "out.jsonl"
+    for page, words in ((tmp_path, "is a folder"), (tmp_path / "no" / "r.html", "does not exist"), (output, "output")):
+        assert run(image_folder, output, "--html", page) == 2
+        assert_one_line(capsys.readouterr(), str(page), words)
+    assert not (tmp_path / "out.jsonl.work").exists()
