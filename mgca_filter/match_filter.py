@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
-from .fit.verdict import Verdict, count_distinct, judge
+from .fit.verdict import Verdict, count_distinct, judge, judge_homography
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import (
@@ -44,8 +44,8 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold, keep_precision, confidence, method, effort, max_iterations, model, providers, backend, seed: as in
-            :func:`filter_matches`.
+        threshold, keep_precision, confidence, method, effort, geometry, max_iterations, model, providers, backend,
+            seed: as in :func:`filter_matches`.
 
     Raises:
         TypeError, ValueError: an option is not one of the above.
@@ -62,6 +62,7 @@ class MatchFilter:
         confidence: float = FilterOptions.confidence,
         method: str | int = FilterOptions.method,
         effort: str = FilterOptions.effort,
+        geometry: str = FilterOptions.geometry,
         max_iterations: int = FilterOptions.max_iterations,
         model: str | Path | None = None,
         providers: Providers | None = None,
@@ -75,6 +76,7 @@ class MatchFilter:
             confidence=confidence,
             method=method_name(method),
             effort=effort,
+            geometry=geometry,
             max_iterations=max_iterations,
             seed=seed,
         )
@@ -143,13 +145,20 @@ class MatchFilter:
         if not isinstance(pair, MatchPair):
             raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
         prepared = prepare_pair(pair)
-        job = _Job(prepared, timings_ms={"prepare": _milliseconds_since(started)})
+        given = prepared.calibrated
+        if self.options.geometry == "essential" and not given:
+            raise ValueError("K1: geometry='essential' needs the intrinsics")
+        if self.options.geometry == "fundamental":
+            camera1, camera2 = (replace(c, guessed=True) for c in (prepared.intrinsics1, prepared.intrinsics2))
+            prepared = replace(prepared, intrinsics1=camera1, intrinsics2=camera2)
+        job = _Job(prepared, given, timings_ms={"prepare": _milliseconds_since(started)})
         started = time.perf_counter()
         if self.options.method != "none":
             job.evidence = gather_before(prepared)
-            job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
-            if self.options.method == "auto" and self.options.effort == "auto":
-                job.model = job.search.before_network()
+            if self.options.geometry != "homography":
+                job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
+                if self.options.method == "auto" and self.options.effort == "auto":
+                    job.model = job.search.before_network()
             job.timings_ms["fit"] = _milliseconds_since(started)
         if job.model is None:
             job.sent = select_network_input(
@@ -179,8 +188,12 @@ class MatchFilter:
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             threshold_px, choice = pair.threshold_px(self.options.threshold), self._backend.metadata.choice
-            verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
-            if self.options.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
+            if self.options.geometry == "homography":
+                verdict = judge_homography(pair, job.evidence, threshold_px, self.options)
+            else:
+                verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
+            found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
+            if self.options.keep_precision is not None and found:
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
         return FilterResult(
@@ -191,9 +204,10 @@ class MatchFilter:
             F=verdict.F,
             R=verdict.R,
             t=verdict.t,
+            H=verdict.H,
             status=verdict.status,
             num_inliers=int(np.count_nonzero(verdict.mask)),
-            confidence=None if verdict.R is None or job.model is None else job.model.confidence,
+            confidence=None if verdict.t is None or job.model is None else job.model.confidence,
             points1=pair.points1,
             points2=pair.points2,
             indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
@@ -214,12 +228,13 @@ class MatchFilter:
 
     def _fit(self, job: _Job, logits: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
         """The model on what the network saw."""
-        if job.search is None or job.sent is None:
+        if job.evidence is None or job.sent is None:
             return
         started = time.perf_counter()
         margins = logits - np.float32(self._backend.metadata.decision_threshold)
         job.evidence = gather_scored(job.pair, job.sent.rows, scores, margins, job.network_essential)
-        job.model = job.search.with_network(job.evidence)
+        if job.search is not None:
+            job.model = job.search.with_network(job.evidence)
         job.timings_ms["fit"] += _milliseconds_since(started)
 
     def _score_by_residuals(
@@ -245,7 +260,7 @@ class MatchFilter:
             "backend": self._backend.name,
             "model": self._backend.metadata.name,
             "model_sha256": self._backend.metadata.sha256,
-            "intrinsics": "given" if job.pair.calibrated else "guessed",
+            "intrinsics": "given" if job.given else "guessed",
             "assumptions": list(job.pair.assumptions),
             "num_network_matches": 0 if job.sent is None else len(job.sent.rows),
             "network_rows": np.zeros(0, dtype=np.intp) if job.sent is None else job.sent.rows,
@@ -261,6 +276,7 @@ class _Job:
     """One pair on its way through the steps."""
 
     pair: PairInput
+    given: bool
     timings_ms: dict[str, float]
     evidence: Evidence | None = None
     search: Search | None = None
@@ -290,6 +306,7 @@ def filter_matches(
     confidence: float = FilterOptions.confidence,
     method: str | int = FilterOptions.method,
     effort: str = FilterOptions.effort,
+    geometry: str = FilterOptions.geometry,
     max_iterations: int = FilterOptions.max_iterations,
     attributes: MatchAttributes | None = None,
     K: MatrixLike | None = None,
@@ -323,6 +340,9 @@ def filter_matches(
             ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
         effort: ``"auto"`` leaves the network out where a run on the list alone explains it, and takes the scores from
             the residuals; ``"full"`` always runs it.
+        geometry: ``"auto"``: an essential matrix where intrinsics are given, else a fundamental matrix, and a
+            homography beside or instead of it where that explains the pair; ``"essential"`` demands the intrinsics;
+            ``"fundamental"`` does not let them constrain the model; ``"homography"`` fits one and no more.
         max_iterations: largest number of samples that one run of a robust estimator draws.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         K: another way to say that both images share ``K1``.
@@ -348,6 +368,7 @@ def filter_matches(
         confidence=confidence,
         method=method,
         effort=effort,
+        geometry=geometry,
         max_iterations=max_iterations,
         model=model,
         providers=providers,
