@@ -38,7 +38,13 @@ class OneLineParser(argparse.ArgumentParser):
 def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = False) -> None:
     """The options that :func:`filter_options` reads; with ``fit_required`` scores alone are no method."""
     group = parser.add_argument_group("filter")
-    group.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
+    group.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=positive(float),
+        default=1.0,
+        help="pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default 1.0",
+    )
     group.add_argument(
         "--keep-precision",
         metavar="P",

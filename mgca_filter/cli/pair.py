@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..errors import MgcaFilterError
-from ..features import DETECTORS
+from ..features import DETECTORS, detector_resolution
 from ..images import decode_image, intrinsics_doubts
 from ..match_images import match_images
 from .arguments import (
@@ -151,7 +151,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
         K2,
         size1=report.sizes[0],
         size2=report.sizes[1],
-        threshold_px=options.threshold,
+        threshold_px=options.threshold * max(map(detector_resolution, report.sizes)),
         seed=options.seed,
     )
     return report.with_baselines(baselines)

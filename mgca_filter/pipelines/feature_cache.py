@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..features import ImageFeatures
+from ..features import ImageFeatures, detector_resolution
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
 
@@ -56,14 +56,15 @@ class FeatureCache:
                 table, descriptors, (width, height) = data["keypoints"], data["descriptors"], data["image_size"]
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
             return None
-        return ImageFeatures(table[:, :2], table[:, 2], table[:, 3], descriptors, None, (int(width), int(height)))
+        size = (int(width), int(height))
+        return ImageFeatures(table[:, :2], table[:, 2], table[:, 3], descriptors, None, size, detector_resolution(size))
 
     def _write(self, name: str, features: ImageFeatures) -> None:
         size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))
         with output_file(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(
                 file,
-                keypoints=np.column_stack([features.points, size, angle]),
+                keypoints=np.column_stack([features.points, size, angle]).astype(np.float32),
                 descriptors=descriptors,
                 image_size=np.array(features.image_size),
             )

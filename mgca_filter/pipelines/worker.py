@@ -128,7 +128,12 @@ class PairWorker:
         else:
             candidates, pairs = matches, np.asarray(matches)
             known = _known_of(image1, image2, pairs)
-        sizes: dict[str, Any] = {"size1": image1.image_size, "size2": image2.image_size, "attributes": known}
+        sizes: dict[str, Any] = {
+            "size1": image1.image_size,
+            "size2": image2.image_size,
+            "attributes": known,
+            "resolution": max(image1.resolution, image2.resolution),
+        }
         if image1.K is not None and image2.K is not None:
             result = self._filter.filter(image1.points, image2.points, candidates, K1=image1.K, K2=image2.K, **sizes)
             if result.status is not Status.SUSPICIOUS_INTRINSICS:

@@ -58,6 +58,21 @@ def test_rows_equal_match_images(image_folder, views, expected):
         assert pose_error_deg(row["R"], row["t"], R, view2.t - R @ view1.t) < 2.0
 
 
+def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
+    factor = 2.5
+    large = [cv2.resize(view.image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) for view in views[:2]]
+    (tmp_path / "images").mkdir()
+    for view, image in zip(views, large):
+        cv2.imwrite(str(tmp_path / "images" / view.name), image)
+    fx, fy, cx, cy = (views[0].K[[0, 1, 0, 1], [0, 1, 2, 2]] * factor).tolist()
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    words = ["--K", f"{fx},{fy},{cx},{cy}", "-q"]
+    assert cli.main(["folder", str(tmp_path / "images"), "-o", str(tmp_path / "out.jsonl"), *words]) == 0
+    (row,) = read_rows(tmp_path / "out.jsonl")
+    alone, strict = (match_images(*large, K1=K, method="prosac", **options) for options in ({}, {"resolution": 1.0}))
+    assert row["num_inliers"] == alone.result.num_inliers > strict.result.num_inliers
+
+
 def test_processes_give_the_same_rows(image_folder, tmp_path, expected):
     assert run(image_folder, tmp_path / "out.jsonl", "-j", 2) == 0
     assert (tmp_path / "out.jsonl").read_text() == expected
