@@ -324,14 +324,12 @@ def write_database(
     names: Sequence[str],
     read: Callable[[str], ImageFeatures | None],
     rows: Iterable[PairRow],
-    K: NDArray[np.float64] | None,
 ) -> None:
     """Cameras, images, keypoints, descriptors where they are bytes long, kept matches and two-view geometries.
 
     Args:
-        path: the file to make. names: images; those that ``read`` has no features for are left out.
-        K: (3, 3) intrinsics in OpenCV's pixels of one pinhole camera for all images of a size, or None: one
-            SIMPLE_RADIAL camera per image, of guessed focal length.
+        path: the file to make. names: images; those that ``read`` has no features for are left out. Images of the same
+            intrinsics share a pinhole camera; those without have a SIMPLE_RADIAL camera each, of guessed focal length.
 
     Raises:
         PipelineError: the disk is full.
@@ -339,24 +337,23 @@ def write_database(
     try:
         with closing(pycolmap.Database.open(path)) as database:
             with pycolmap.DatabaseTransaction(database):
-                ids = _write_images(database, names, read, K)
+                ids = _write_images(database, names, read)
             write_geometries(database, ids, _with_matches(database, ids, rows))
     except (RuntimeError, ValueError) as error:
         raise PipelineError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
-def _write_images(
-    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], K: NDArray[np.float64] | None
-) -> dict[str, int]:
+def _write_images(database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> dict[str, int]:
     ids: dict[str, int] = {}
-    cameras: dict[tuple[int, int], int] = {}
+    cameras: dict[tuple[Any, ...], int] = {}
     for name in names:
         image = read(name)
         if image is None or image.image_size is None:
             continue
-        if K is None or image.image_size not in cameras:
-            cameras[image.image_size] = database.write_camera(_camera(image.image_size, K))
-        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[image.image_size]))
+        key = (name,) if image.K is None else (*image.image_size, *image.K.ravel())
+        if key not in cameras:
+            cameras[key] = database.write_camera(_camera(image.image_size, image.K))
+        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[key]))
         table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
         database.write_keypoints(ids[name], table.astype(np.float32))
         if image.descriptors is not None and image.descriptors.shape[1:] == (128,):

@@ -15,6 +15,8 @@ from ..features import ImageFeatures, detector_resolution
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
 
+_UNREADABLE = (OSError, ValueError, KeyError, zipfile.BadZipFile)
+
 
 @dataclass(frozen=True)
 class FeatureCache:
@@ -54,10 +56,19 @@ class FeatureCache:
         try:
             with np.load(self._path(name)) as data:
                 table, descriptors, (width, height) = data["keypoints"], data["descriptors"], data["image_size"]
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+        except _UNREADABLE:
             return None
         size = (int(width), int(height))
         return ImageFeatures(table[:, :2], table[:, 2], table[:, 3], descriptors, None, size, detector_resolution(size))
+
+    def size(self, name: str) -> tuple[int, int] | None:
+        """(width, height) of an image in pixels; None where there are no features of it."""
+        try:
+            with np.load(self._path(name)) as data:
+                width, height = data["image_size"]
+        except _UNREADABLE:
+            return None
+        return int(width), int(height)
 
     def _write(self, name: str, features: ImageFeatures) -> None:
         size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))

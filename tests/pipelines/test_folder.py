@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -313,18 +314,33 @@ def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
     assert max(model.num_reg_images() for model in models.values()) == 4
 
 
-def test_intrinsics_of_another_size_are_told(image_folder, tmp_path, capsys):
-    """The rows are those of the matches; what is odd about the camera is a line, unless the user wants quiet."""
-    (image_folder / "view03.png").write_bytes(b"")
+def test_images_of_another_size_are_named_and_matched_without_K(image_folder, tmp_path, capsys):
     image = cv2.imread(str(image_folder / "view00.png"))
     cv2.imwrite(str(image_folder / "view00.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
-    few = [str(image_folder), "--K", K_WORDS, "--max-keypoints", "300"]
+    few = [str(image_folder), "--K", K_WORDS, "--max-keypoints", "500"]
     cli.main(["folder", *few, "-o", str(tmp_path / "a.jsonl")])
-    assert "mgca-match: one K for images of 2 sizes (480 x 640, 640 x 480)" in capsys.readouterr().err
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mgca-match:")]
+    assert told == ["mgca-match: one K is that of one size, here 640 x 480: matched without it: view00.png (480 x 640)"]
+    rows = read_rows(tmp_path / "a.jsonl")
+    assert {row["calibrated"] for row in rows if "view00.png" in (row["image1"], row["image2"])} == {False}
+    assert {row["calibrated"] for row in rows if "view00.png" not in (row["image1"], row["image2"])} == {True}
     cli.main(["folder", *few, "-q", "-o", str(tmp_path / "b.jsonl")])
     assert "one K" not in capsys.readouterr().err
     cli.main(["folder", str(image_folder), "--max-keypoints", "300", "-o", str(tmp_path / "c.jsonl")])
     assert "one K" not in capsys.readouterr().err
+
+
+def test_cameras_of_the_database_are_those_that_the_images_were_matched_with(image_folder, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    cv2.imwrite(str(image_folder / "view00.png"), np.zeros((640, 480), np.uint8))
+    assert run(image_folder, tmp_path / "out.db", "--max-keypoints", 300) == 0
+    with contextlib.closing(pycolmap.Database.open(tmp_path / "out.db")) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        of = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+    assert len(cameras) == 2
+    assert not of["view00.png"].has_prior_focal_length
+    assert of["view01.png"].has_prior_focal_length
+    np.testing.assert_allclose(of["view02.png"].params, [512, 512, 320, 240])
 
 
 def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path, expected):
