@@ -111,10 +111,12 @@ class MatchFilter:
         size2: SizeLike | None = None,
         attributes: MatchAttributes | None = None,
         K: MatrixLike | None = None,
+        resolution: float = 1.0,
     ) -> FilterResult:
         """Filter the matches of one pair; arguments, result and errors as in :func:`filter_matches`."""
         K1 = _shared_intrinsics(K, K1, K2)
-        return self.filter_many([MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)])[0]
+        pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes, resolution)
+        return self.filter_many([pair])[0]
 
     @np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
     def filter_many(self, pairs: Iterable[MatchPair | tuple[Any, Any, Any]]) -> list[FilterResult]:
@@ -348,6 +350,7 @@ def filter_matches(
     max_iterations: int = FilterOptions.max_iterations,
     attributes: MatchAttributes | None = None,
     K: MatrixLike | None = None,
+    resolution: float = 1.0,
     model: str | Path | None = None,
     providers: Providers | None = None,
     backend: str = "auto",
@@ -384,6 +387,9 @@ def filter_matches(
         max_iterations: largest number of samples that one run of a robust estimator draws.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         K: another way to say that both images share ``K1``.
+        resolution: pixels of the original per pixel of the image in which the keypoints were found: the factor by which
+            coordinates that were found in a smaller copy were multiplied, the larger of the two images'. ``threshold``,
+            and the pixels by which the fit judges, are then those of the copy.
         model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
         backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
@@ -413,7 +419,7 @@ def filter_matches(
         backend=backend,
         seed=seed,
     )
-    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)
+    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes, resolution)
     return match_filter.filter_many([pair])[0]
 
 

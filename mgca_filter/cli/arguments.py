@@ -39,7 +39,11 @@ def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = 
     """The options that :func:`filter_options` reads; with ``fit_required`` scores alone are no method."""
     group = parser.add_argument_group("filter")
     group.add_argument(
-        "--threshold", metavar="PX", type=positive(float), default=FilterOptions.threshold, help="pixels, default 1.0"
+        "--threshold",
+        metavar="PX",
+        type=positive(float),
+        default=FilterOptions.threshold,
+        help="pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default 1.0",
     )
     group.add_argument(
         "--keep-precision",

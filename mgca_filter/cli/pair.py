@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..errors import MgcaFilterError
-from ..features import DETECTORS
-from ..images import decode_image, intrinsics_doubts
+from ..features import DETECTORS, detector_resolution
+from ..images import decode_image, principal_point_doubt
 from ..match_images import match_images
 from .arguments import (
     EXIT_FOUND,
@@ -73,7 +73,7 @@ def build_parser() -> argparse.ArgumentParser:
     out.add_argument("-q", "--quiet", action="store_true", help="no summary, errors only")
     out.add_argument("-v", "--verbose", action="store_true", help="log what is done, on stderr")
     camera = parser.add_argument_group("cameras", "fx,fy,cx,cy in pixels; without them the focal length is guessed")
-    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of both images")
+    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of both images, of one size")
     camera.add_argument("--K1", metavar="fx,fy,cx,cy", type=intrinsics, help="of the first image, with --K2")
     camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=intrinsics, help="of the second image, with --K1")
     matching = parser.add_argument_group("matching")
@@ -111,11 +111,12 @@ def _check_outputs(options: argparse.Namespace) -> None:
 
 
 def _camera_matrices(options: argparse.Namespace) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """K1 and K2; the second is None where both images share the first, so that other sizes are refused."""
     if (options.K1 is None) != (options.K2 is None):
         raise UsageError("--K1 and --K2 go together; --K is for both images")
     if options.K is not None and options.K1 is not None:
         raise UsageError("--K excludes --K1 and --K2")
-    return (options.K, options.K) if options.K is not None else (options.K1, options.K2)
+    return (options.K, None) if options.K is not None else (options.K1, options.K2)
 
 
 def _match(options: argparse.Namespace) -> MatchReport:
@@ -124,10 +125,6 @@ def _match(options: argparse.Namespace) -> MatchReport:
     _check_outputs(options)
     image1, image2 = read_image(options.image1), read_image(options.image2)
     _log.info("%s: %d x %d, %s: %d x %d", options.image1, *image1.shape[1::-1], options.image2, *image2.shape[1::-1])
-    sizes = [(image.shape[1], image.shape[0]) for image in (image1, image2)]
-    for K, of in ((options.K, sizes), (options.K1, sizes[:1]), (options.K2, sizes[1:])):
-        for doubt in [] if K is None else intrinsics_doubts(K, of):
-            _log.warning("warning: %s", doubt)
     start = time.perf_counter()
     matched = match_images(
         image1,
@@ -141,6 +138,11 @@ def _match(options: argparse.Namespace) -> MatchReport:
     total_ms = 1e3 * (time.perf_counter() - start)
     for assumption in matched.result.info.get("assumptions", ()):
         _log.info("assumed: %s", assumption)
+    K2 = K1 if K2 is None else K2
+    for K, image in ((K1, image1), (K2, image2)):
+        doubt = None if K is None else principal_point_doubt(K, (image.shape[1], image.shape[0]))
+        if doubt is not None:
+            _log.warning("warning: %s", doubt)
     report = MatchReport(options.image1, options.image2, image1, image2, K1, K2, matched, total_ms)
     if not options.compare:
         return report
@@ -151,7 +153,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
         K2,
         size1=report.sizes[0],
         size2=report.sizes[1],
-        threshold_px=options.threshold,
+        threshold_px=options.threshold * max(map(detector_resolution, report.sizes)),
         seed=options.seed,
     )
     return report.with_baselines(baselines)

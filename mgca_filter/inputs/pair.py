@@ -13,6 +13,7 @@ from ..types import MatchesLike, MatrixLike, PointsLike, SizeLike
 from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
 from .matches import PutativeMatches, read_matches
+from .options import check_number
 
 # Coordinates are taken for pixels unless both the focal length and the extent of the keypoints are smaller than any
 # camera's, as where the caller normalised the points or measures in millimetres on the sensor. Without a focal length
@@ -30,7 +31,11 @@ _MAX_NORMALIZED = 1e3
 
 @dataclass(frozen=True)
 class MatchPair:
-    """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`."""
+    """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`.
+
+    ``resolution``: pixels of the original per pixel of the image in which the keypoints were found; larger than 1 where
+    they were found in a smaller copy.
+    """
 
     kp1: PointsLike
     kp2: PointsLike
@@ -42,6 +47,7 @@ class MatchPair:
     size1: SizeLike | None = None
     size2: SizeLike | None = None
     attributes: MatchAttributes | None = None
+    resolution: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -57,9 +63,10 @@ class PairInput:
         order: (M,) float64, ascending = promising: the ratio where it is known, else the descriptor distance; NaN where
             neither is.
         intrinsics1, intrinsics2: cameras, given or guessed, in pixels.
-        unit_px: pixels to a unit of the caller's coordinates: 1, or where these are normalised or millimetres, the
-            number that makes pixels of them.
-        largest_threshold: a threshold above this is in pixels already, whatever the unit.
+        unit_px: pixels to a unit of the caller's coordinates, pixels being those of the image in which the keypoints
+            were found: 1; of a smaller copy 1 / ``resolution``; where the coordinates are normalised or millimetres,
+            the number that makes pixels of them.
+        largest_threshold: a threshold above this is in those pixels already, whatever the unit.
         assumptions: sentences on what was assumed.
     """
 
@@ -73,7 +80,7 @@ class PairInput:
     intrinsics1: Intrinsics
     intrinsics2: Intrinsics
     unit_px: float = 1.0
-    largest_threshold: float = float("inf")
+    largest_threshold: float = 0.0
     assumptions: tuple[str, ...] = ()
 
     @property
@@ -99,7 +106,7 @@ class PairInput:
         )
 
     def threshold_px(self, threshold: float) -> float:
-        """The caller's threshold in pixels."""
+        """The caller's threshold in pixels of the image in which the keypoints were found."""
         return threshold if threshold > self.largest_threshold else threshold * self.unit_px
 
     def fundamental_in_units(self, F: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,17 +141,25 @@ def prepare_pair(pair: MatchPair) -> PairInput:
     _check_shared_camera(pair)
     given1, given2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
     extent = max(_extent(keypoints1.points), _extent(keypoints2.points))
+    resolution = check_number(pair.resolution, "resolution", 0.0, float("inf"))
     unit_px, yardstick = _pixels_per_unit(given1, given2, extent)
+    in_pixels = unit_px == 1.0
+    if in_pixels:
+        unit_px = 1.0 / resolution
     points1, points2 = keypoints1.points * unit_px, keypoints2.points * unit_px
     if unit_px == 1.0:
         intrinsics1, intrinsics2 = given1, given2
-    elif given1.guessed:
+    elif given1.guessed and not in_pixels:
         intrinsics1, intrinsics2 = resolve_intrinsics(points1, points2)
     else:
         zoom = np.diag([unit_px, unit_px, 1.0])
         intrinsics1, intrinsics2 = (replace(camera, K=zoom @ camera.K) for camera in (given1, given2))
     assumptions = [camera.assumption for camera in (intrinsics1, intrinsics2) if camera.assumption]
-    if unit_px != 1.0:
+    if in_pixels and resolution != 1.0:
+        assumptions.append(
+            f"thresholds are in pixels of the image in which the keypoints were found, {resolution:.3g} of K's to one"
+        )
+    if not in_pixels:
         assumptions.append(
             f"coordinates are no pixels, they extend over {extent:.3g}: thresholds are those of an image in which "
             f"{yardstick:.3g} is {_USUAL_PIXELS:g} pixels"
@@ -182,7 +197,7 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         intrinsics1,
         intrinsics2,
         unit_px,
-        _LARGEST_THRESHOLD_SHARE * yardstick if unit_px != 1.0 else float("inf"),
+        0.0 if in_pixels else _LARGEST_THRESHOLD_SHARE * yardstick,
         tuple(assumptions),
     )
 

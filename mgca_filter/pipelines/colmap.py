@@ -21,9 +21,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from .journal import Journal, PipelineError, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow, Unusable
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import PairRow, Unusable
 
 HALF_PIXEL = 0.5
 # COLMAP's own guess for a camera of which nothing is known.
@@ -51,11 +52,13 @@ class ColmapJob:
         database: read, and changed only where ``output`` is the same path.
         output: gets everything that ``database`` holds, with our ``two_view_geometries``.
         use_descriptors: compute each match's distance ratio from SIFT descriptors where the database holds them.
+        report: an HTML report of the run, or None.
     """
 
     database: Path
     output: Path
     use_descriptors: bool = True
+    report: Report | None = None
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
@@ -80,6 +83,8 @@ class ColmapJob:
                 summary = run_pairs(source, workers, journal, quiet)
                 write_geometries(database, source.ids, journal.rows())
             self._deliver(copy)
+            if self.report is not None:
+                self.report.write(journal.rows())
         finally:
             journal.close()
         shutil.rmtree(work)
@@ -319,14 +324,12 @@ def write_database(
     names: Sequence[str],
     read: Callable[[str], ImageFeatures | None],
     rows: Iterable[PairRow],
-    K: NDArray[np.float64] | None,
 ) -> None:
     """Cameras, images, keypoints, descriptors where they are bytes long, kept matches and two-view geometries.
 
     Args:
-        path: the file to make. names: images; those that ``read`` has no features for are left out.
-        K: (3, 3) intrinsics in OpenCV's pixels of one pinhole camera for all images of a size, or None: one
-            SIMPLE_RADIAL camera per image, of guessed focal length.
+        path: the file to make. names: images; those that ``read`` has no features for are left out. Images of the same
+            intrinsics share a pinhole camera; those without have a SIMPLE_RADIAL camera each, of guessed focal length.
 
     Raises:
         PipelineError: the disk is full.
@@ -334,24 +337,23 @@ def write_database(
     try:
         with closing(pycolmap.Database.open(path)) as database:
             with pycolmap.DatabaseTransaction(database):
-                ids = _write_images(database, names, read, K)
+                ids = _write_images(database, names, read)
             write_geometries(database, ids, _with_matches(database, ids, rows))
     except (RuntimeError, ValueError) as error:
         raise PipelineError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
-def _write_images(
-    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], K: NDArray[np.float64] | None
-) -> dict[str, int]:
+def _write_images(database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> dict[str, int]:
     ids: dict[str, int] = {}
-    cameras: dict[tuple[int, int], int] = {}
+    cameras: dict[tuple[Any, ...], int] = {}
     for name in names:
         image = read(name)
         if image is None or image.image_size is None:
             continue
-        if K is None or image.image_size not in cameras:
-            cameras[image.image_size] = database.write_camera(_camera(image.image_size, K))
-        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[image.image_size]))
+        key = (name,) if image.K is None else (*image.image_size, *image.K.ravel())
+        if key not in cameras:
+            cameras[key] = database.write_camera(_camera(image.image_size, image.K))
+        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[key]))
         table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
         database.write_keypoints(ids[name], table.astype(np.float32))
         if image.descriptors is not None and image.descriptors.shape[1:] == (128,):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from mgca_filter.fit.ranking import distinct_rows
 
+from mgca_filter.fit.evidence import distinct_rows
 from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.inputs.attributes import MatchAttributes, candidate_mask
 

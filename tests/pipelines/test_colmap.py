@@ -84,6 +84,12 @@ def test_everything_else_is_copied(few_pairs, tmp_path):
             assert before.execute(query).fetchall() == after.execute(query).fetchall()
 
 
+def test_a_report_lies_beside_the_output(few_pairs, tmp_path):
+    assert cli.main(["colmap", str(few_pairs), "-o", str(tmp_path / "out.db"), "--html", str(tmp_path / "r.html")]) == 0
+    assert "view01.png" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert len(read_geometries(tmp_path / "out.db")) == 2
+
+
 def test_in_place_equals_a_copy(few_pairs, tmp_path):
     database = few_pairs
     assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
