@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
-from .fit.focal_estimate import FocalEstimate, estimate_focal
+from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focal
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge, judge_homography
 from .geometry.epipolar import project_to_essential
@@ -259,7 +259,7 @@ class MatchFilter:
         evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
         search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
         model = search.with_network(evidence)
-        if model is not None:
+        if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
             job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
 
     def _score_by_residuals(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..geometry.epipolar import project_to_essential, sampson_distance
 from ..geometry.pose_refinement import refine_pose, truncated_cost
 from .evidence import Evidence
-from .robust_fit import REFINE_PX, pose_from_essential
+from .robust_fit import REFINE_PX, TwoViewModel, pose_from_essential
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,8 @@ _REACH_PX = 16.0
 _ROUNDS = 6
 _MAX_ROWS = 300
 _MIN_ROWS = 12
+# With this share of the matches that agree with F an essential matrix takes its place.
+_LEAST_AGREEMENT = 0.8
 # Beyond this standard deviation of the logarithm the matches do not determine the focal length.
 DETERMINED = 0.2
 
@@ -79,6 +81,19 @@ def estimate_focal(evidence: Evidence, F: Array) -> FocalEstimate | None:
     at = float(np.clip(-curve[1] / (2.0 * curve[0]), logs[best - 1], logs[best + 1]))
     # A sum of squares over the noise: it rises by one at a standard deviation.
     return FocalEstimate(float(np.exp(at)), float(1.0 / np.sqrt(curve[0])))
+
+
+def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free_model: TwoViewModel) -> bool:
+    """True where nearly as many matches agree with an essential matrix as with the F that knows no intrinsics.
+
+    Args:
+        evidence, model: under the estimated focal length. free, free_model: under the guessed one.
+    """
+    counts = [
+        np.count_nonzero(sampson_distance(e.correspondences[e.above(0.0)], m.M) < REFINE_PX / e.focal_px)
+        for e, m in ((evidence, model), (free, free_model))
+    ]
+    return bool(counts[0] >= _LEAST_AGREEMENT * counts[1])
 
 
 def _cost_px(rows: Array, F: Array, factor: float, focal_px: float) -> float:
