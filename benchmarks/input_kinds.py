@@ -527,8 +527,10 @@ def run(options: argparse.Namespace) -> int:
     study = Study.of(cells)
     print(format_study(study, gaps=options.gaps is not None))
     if options.json is not None:
+        asked = {"per_scene": options.per_scene, "seed": options.seed, "seeds": options.seeds, "gaps": options.gaps}
+        content = {"filter": ProductMethod("product", model=options.model).settings(), "options": asked}
         with replaced_when_done(options.json) as temporary:
-            temporary.write_text(json.dumps(study.to_json(), indent=1))
+            temporary.write_text(json.dumps({**content, **study.to_json()}, indent=1))
     return 0
 
 
