@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..exif import exif_intrinsics
 from ..features import (
     ImageFeatures,
     attributes_of_matches,
@@ -142,7 +143,8 @@ class PairWorker:
         return self._filter.filter(image1.points, image2.points, candidates, **sizes), pairs
 
     def extract(self, name: str, encoded: bytes, detector: str, max_keypoints: int) -> tuple[str, ImageFeatures | None]:
-        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too).
+        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too), and K
+        where its EXIF knows the focal length.
 
         None in place of the features of a file that cannot be decoded.
         """
@@ -150,7 +152,8 @@ class PairWorker:
             image = decode_image(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         except ValueError:
             return name, None
-        return name, describe(image, create_detector(detector, max_keypoints))
+        features = describe(image, create_detector(detector, max_keypoints))
+        return name, replace(features, K=exif_intrinsics(encoded, (image.shape[1], image.shape[0])))
 
 
 def call_worker(filter_options: str, method: str, task: tuple[Any, ...]) -> Any:
