@@ -33,6 +33,9 @@ _GUESSED_FOCAL_FACTOR = 1.2
 _SQLITE_BUSY, _SQLITE_LOCKED = 5, 6
 # Pixels of COLMAP to pixels of OpenCV, homogeneous.
 _TO_OPENCV = np.array([[1.0, 0.0, -HALF_PIXEL], [0.0, 1.0, -HALF_PIXEL], [0.0, 0.0, 1.0]])
+# Half the width of the difference that stands for a derivative; keypoints are float32.
+_STRETCH_STEP_PX = 0.25
+_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 _CONFIGURATIONS = {
     ("ok", True): _Configuration.CALIBRATED,
@@ -232,6 +235,7 @@ class DatabaseSource:
             self._sift_descriptors(image_id, len(table)),
             K if camera.has_prior_focal_length else None,
             (camera.width, camera.height),
+            stretch=stretch(camera, table[:, :2]),
         )
 
     def _sift_descriptors(self, image_id: int, count: int) -> NDArray[np.uint8] | None:
@@ -265,6 +269,17 @@ def undistorted(camera: Any, points: NDArray[Any]) -> NDArray[np.float64]:
     on_plane = np.asarray(camera.cam_from_img(points.astype(np.float64)), dtype=np.float64).reshape(-1, 2)
     pixels: NDArray[np.float64] = on_plane * K[[0, 1], [0, 1]] + K[:2, 2]
     return pixels
+
+
+def stretch(camera: Any, points: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Derivatives (N, 2, 2) of :func:`undistorted` by the keypoints (N, 2); None for a camera without distortion."""
+    if camera.model in _PINHOLES:
+        return None
+    columns = [
+        (undistorted(camera, points + step) - undistorted(camera, points - step)) / (2.0 * _STRETCH_STEP_PX)
+        for step in _STRETCH_STEP_PX * np.eye(2)
+    ]
+    return np.stack(columns, axis=2)
 
 
 def keypoint_shapes(table: NDArray[Any]) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
