@@ -35,6 +35,7 @@ class ImageFeatures:
         K: (3, 3) intrinsics, or None.
         image_size: (width, height) in pixels, or None.
         resolution: pixels of the image per pixel of the copy in which the keypoints were found.
+        stretch: (N, 2, 2) derivatives of ``points`` by the distorted pixels that they were found at, or None.
     """
 
     points: NDArray[Any]
@@ -44,16 +45,18 @@ class ImageFeatures:
     K: NDArray[np.float64] | None = None
     image_size: tuple[int, int] | None = None
     resolution: float = 1.0
+    stretch: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     def take(self, rows: NDArray[np.intp]) -> ImageFeatures:
         """The keypoints of the given rows (n,) alone."""
-        size, angle, descriptors = (
-            None if field is None else field[rows] for field in (self.size, self.angle, self.descriptors)
+        size, angle, descriptors, stretch = (
+            None if field is None else field[rows] for field in (self.size, self.angle, self.descriptors, self.stretch)
         )
-        return replace(self, points=self.points[rows], size=size, angle=angle, descriptors=descriptors)
+        points = self.points[rows]
+        return replace(self, points=points, size=size, angle=angle, descriptors=descriptors, stretch=stretch)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
 from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focal
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge, judge_homography
+from .geometry.cameras import Fisheye
 from .geometry.epipolar import project_to_essential
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
@@ -105,8 +106,8 @@ class MatchFilter:
         *,
         K1: MatrixLike | None = None,
         K2: MatrixLike | None = None,
-        dist1: ArrayLike | None = None,
-        dist2: ArrayLike | None = None,
+        dist1: ArrayLike | Fisheye | None = None,
+        dist2: ArrayLike | Fisheye | None = None,
         size1: SizeLike | None = None,
         size2: SizeLike | None = None,
         attributes: MatchAttributes | None = None,
@@ -337,8 +338,8 @@ def filter_matches(
     *,
     K1: MatrixLike | None = None,
     K2: MatrixLike | None = None,
-    dist1: ArrayLike | None = None,
-    dist2: ArrayLike | None = None,
+    dist1: ArrayLike | Fisheye | None = None,
+    dist2: ArrayLike | Fisheye | None = None,
     size1: SizeLike | None = None,
     size2: SizeLike | None = None,
     threshold: float = FilterOptions.threshold,
@@ -368,7 +369,9 @@ def filter_matches(
             best of the list, size, angle) is used and never required.
         K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal length is
             guessed and F is the model to trust.
-        dist1, dist2: OpenCV distortion coefficients; E and F then hold for undistorted points.
+        dist1, dist2: OpenCV distortion coefficients: an array of 4, 5, 8, 12 or 14 is of the pinhole model,
+            ``Fisheye(k1, k2, k3, k4)`` of ``cv2.fisheye``. E and F then hold for undistorted points, the threshold for
+            the pixels that came in.
         size1, size2: (width, height), pixels; they help the guess of missing intrinsics.
         threshold: inlier threshold of the mask, pixels (Sampson distance); the fit has its own.
         keep_precision: instead of a threshold: the mask holds the most matches whose expected precision, the mean of

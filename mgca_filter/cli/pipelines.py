@@ -92,6 +92,7 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
     )
     command.add_argument("--overlap", metavar="N", type=positive(int), default=10, help="sequential: N next images")
     command.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of all images, pixels")
+    command.add_argument("--no-exif", action="store_true", help="without --K: guess the focal length, do not read EXIF")
     command.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
     command.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
     command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
@@ -192,6 +193,7 @@ def _run_folder(options: argparse.Namespace) -> Summary:
         options.max_keypoints,
         options.cache,
         _report(options, options.images, [options.output]),
+        exif=not options.no_exif,
     )
     return _with_workers(job, options)
 

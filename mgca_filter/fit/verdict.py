@@ -154,7 +154,7 @@ def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, 
     F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
     mask = np.zeros(len(pair.valid), dtype=bool)
     if pair.calibrated:
-        distance_px = sampson_distance(pair.correspondences[pair.valid], model.M) * pair.focal_px
+        distance_px = pair.epipolar_distance_px(pair.valid, model.M)
     else:
         distance_px = sampson_distance(np.hstack(pair.pixels(pair.valid)), F)
     mask[pair.valid] = distance_px < mask_threshold_px

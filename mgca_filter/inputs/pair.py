@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
+from ..geometry.cameras import Fisheye, Intrinsics, lens_doubt, mean_focal_length, resolve_intrinsics
+from ..geometry.epipolar import sampson_distance
 from ..types import MatchesLike, MatrixLike, PointsLike, SizeLike
 from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
@@ -35,6 +36,10 @@ class MatchPair:
 
     ``resolution``: pixels of the original per pixel of the image in which the keypoints were found; larger than 1 where
     they were found in a smaller copy.
+
+    ``stretch1``, ``stretch2``: of keypoints that were freed of distortion before, the derivatives (N, 2, 2) of the
+    undistorted pixels by the pixels as they were found, NaN where unknown: the threshold is then in pixels of the
+    distorted images. What ``dist1`` and ``dist2`` say has precedence.
     """
 
     kp1: PointsLike
@@ -42,12 +47,14 @@ class MatchPair:
     matches: MatchesLike | None
     K1: MatrixLike | None = None
     K2: MatrixLike | None = None
-    dist1: ArrayLike | None = None
-    dist2: ArrayLike | None = None
+    dist1: ArrayLike | Fisheye | None = None
+    dist2: ArrayLike | Fisheye | None = None
     size1: SizeLike | None = None
     size2: SizeLike | None = None
     attributes: MatchAttributes | None = None
     resolution: float = 1.0
+    stretch1: ArrayLike | None = None
+    stretch2: ArrayLike | None = None
 
 
 @dataclass(frozen=True)
@@ -68,6 +75,8 @@ class PairInput:
             the number that makes pixels of them.
         largest_threshold: a threshold above this is in those pixels already, whatever the unit.
         assumptions: sentences on what was assumed.
+        stretch1, stretch2: (M, 2, 2) derivatives of the undistorted pixels by the pixels that were found; None where
+            lenses distort nothing.
     """
 
     matches: PutativeMatches
@@ -82,6 +91,8 @@ class PairInput:
     unit_px: float = 1.0
     largest_threshold: float = 0.0
     assumptions: tuple[str, ...] = ()
+    stretch1: NDArray[np.float64] | None = None
+    stretch2: NDArray[np.float64] | None = None
 
     @property
     def calibrated(self) -> bool:
@@ -104,6 +115,17 @@ class PairInput:
         return replace(
             self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
         )
+
+    def epipolar_distance_px(
+        self, rows: NDArray[np.intp] | NDArray[np.bool_], E: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Sampson distance (K,) of a selection of matches to E (3, 3), in pixels as they were found.
+
+        Through a lens the derivative of the lens counts: near the rim of a fisheye a pixel is a long way on the image
+        plane.
+        """
+        stretch1, stretch2 = (None if s is None else s[rows] for s in (self.stretch1, self.stretch2))
+        return sampson_distance(self.correspondences[rows], E, stretch1, stretch2) * self.focal_px
 
     def threshold_px(self, threshold: float) -> float:
         """The caller's threshold in pixels of the image in which the keypoints were found."""
@@ -169,6 +191,10 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         for i, camera, size in ((1, given1, pair.size1), (2, given2, pair.size2))
         if not camera.guessed and size is not None and not _inside(camera.K[:2, 2], size)
     ]
+    for i, camera, points in ((1, given1, keypoints1.points), (2, given2, keypoints2.points)):
+        doubt = lens_doubt(camera, points, i)
+        if doubt is not None:
+            assumptions.append(doubt)
     present = (putative.index1 >= 0)[:, None]
     if present.any():
         ends = [
@@ -199,7 +225,34 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         unit_px,
         0.0 if in_pixels else _LARGEST_THRESHOLD_SHARE * yardstick,
         tuple(assumptions),
+        _stretch_of_matches(pair.stretch1, "stretch1", intrinsics1, points1, putative.index1),
+        _stretch_of_matches(pair.stretch2, "stretch2", intrinsics2, points2, putative.index2),
     )
+
+
+def _stretch_of_matches(
+    given: ArrayLike | None,
+    name: str,
+    camera: Intrinsics,
+    points: NDArray[np.float64],
+    index: NDArray[np.intp],
+) -> NDArray[np.float64] | None:
+    """Derivatives (M, 2, 2) of the undistorted pixels of each match by those that were found; None without distortion.
+
+    Where the derivative is not known, that of no distortion stands.
+    """
+    stretch = camera.stretch(points)
+    if stretch is None:
+        if given is None:
+            return None
+        stretch = np.asarray(given, dtype=np.float64)
+        if stretch.shape != (len(points), 2, 2):
+            raise ValueError(f"{name}: expected shape ({len(points)}, 2, 2) like the keypoints, got {stretch.shape}")
+    if len(points) == 0:
+        return np.tile(np.eye(2), (len(index), 1, 1))
+    of_matches = stretch[index]
+    known = np.isfinite(of_matches).all(axis=(1, 2), keepdims=True)
+    return np.where(known, of_matches, np.eye(2))
 
 
 def _order(known: MatchAttributes, matches: PutativeMatches) -> NDArray[np.float64]:

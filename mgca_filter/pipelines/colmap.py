@@ -33,6 +33,9 @@ _GUESSED_FOCAL_FACTOR = 1.2
 _SQLITE_BUSY, _SQLITE_LOCKED = 5, 6
 # Pixels of COLMAP to pixels of OpenCV, homogeneous.
 _TO_OPENCV = np.array([[1.0, 0.0, -HALF_PIXEL], [0.0, 1.0, -HALF_PIXEL], [0.0, 0.0, 1.0]])
+# Half the width of the difference that stands for a derivative; keypoints are float32.
+_STRETCH_STEP_PX = 0.25
+_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 _CONFIGURATIONS = {
     ("ok", True): _Configuration.CALIBRATED,
@@ -232,6 +235,7 @@ class DatabaseSource:
             self._sift_descriptors(image_id, len(table)),
             K if camera.has_prior_focal_length else None,
             (camera.width, camera.height),
+            stretch=stretch(camera, table[:, :2]),
         )
 
     def _sift_descriptors(self, image_id: int, count: int) -> NDArray[np.uint8] | None:
@@ -265,6 +269,17 @@ def undistorted(camera: Any, points: NDArray[Any]) -> NDArray[np.float64]:
     on_plane = np.asarray(camera.cam_from_img(points.astype(np.float64)), dtype=np.float64).reshape(-1, 2)
     pixels: NDArray[np.float64] = on_plane * K[[0, 1], [0, 1]] + K[:2, 2]
     return pixels
+
+
+def stretch(camera: Any, points: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Derivatives (N, 2, 2) of :func:`undistorted` by the keypoints (N, 2); None for a camera without distortion."""
+    if camera.model in _PINHOLES:
+        return None
+    columns = [
+        (undistorted(camera, points + step) - undistorted(camera, points - step)) / (2.0 * _STRETCH_STEP_PX)
+        for step in _STRETCH_STEP_PX * np.eye(2)
+    ]
+    return np.stack(columns, axis=2)
 
 
 def keypoint_shapes(table: NDArray[Any]) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
@@ -324,12 +339,14 @@ def write_database(
     names: Sequence[str],
     read: Callable[[str], ImageFeatures | None],
     rows: Iterable[PairRow],
+    camera_model: str = "PINHOLE",
 ) -> None:
     """Cameras, images, keypoints, descriptors where they are bytes long, kept matches and two-view geometries.
 
     Args:
         path: the file to make. names: images; those that ``read`` has no features for are left out. Images of the same
-            intrinsics share a pinhole camera; those without have a SIMPLE_RADIAL camera each, of guessed focal length.
+            intrinsics share a camera; those without have a SIMPLE_RADIAL camera each, of guessed focal length.
+        camera_model: of images with intrinsics, "PINHOLE", or "SIMPLE_RADIAL" where these are rough.
 
     Raises:
         PipelineError: the disk is full.
@@ -337,13 +354,15 @@ def write_database(
     try:
         with closing(pycolmap.Database.open(path)) as database:
             with pycolmap.DatabaseTransaction(database):
-                ids = _write_images(database, names, read)
+                ids = _write_images(database, names, read, camera_model)
             write_geometries(database, ids, _with_matches(database, ids, rows))
     except (RuntimeError, ValueError) as error:
         raise PipelineError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
-def _write_images(database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None]) -> dict[str, int]:
+def _write_images(
+    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], camera_model: str
+) -> dict[str, int]:
     ids: dict[str, int] = {}
     cameras: dict[tuple[Any, ...], int] = {}
     for name in names:
@@ -352,7 +371,7 @@ def _write_images(database: Any, names: Sequence[str], read: Callable[[str], Ima
             continue
         key = (name,) if image.K is None else (*image.image_size, *image.K.ravel())
         if key not in cameras:
-            cameras[key] = database.write_camera(_camera(image.image_size, image.K))
+            cameras[key] = database.write_camera(_camera(image.image_size, image.K, camera_model))
         ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[key]))
         table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
         database.write_keypoints(ids[name], table.astype(np.float32))
@@ -372,13 +391,14 @@ def _angle(image: ImageFeatures) -> NDArray[Any]:
     return np.zeros(len(image.points)) if image.angle is None else image.angle
 
 
-def _camera(size: tuple[int, int], K: NDArray[np.float64] | None) -> Any:
+def _camera(size: tuple[int, int], K: NDArray[np.float64] | None, model: str) -> Any:
     width, height = size
     if K is None:
         params = [_GUESSED_FOCAL_FACTOR * max(size), width / 2, height / 2, 0.0]
         return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
-    params = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
-    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL
+    params = [fx, fy, cx, cy] if model == "PINHOLE" else [fx, cx, cy, 0.0]
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     camera.has_prior_focal_length = True
     return camera
 

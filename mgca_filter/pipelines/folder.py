@@ -80,16 +80,18 @@ def read_pairs(path: Path, names: Sequence[str], folder: Path) -> list[tuple[str
 
 @dataclass(frozen=True)
 class FolderSource:
-    """Pairs of images whose features lie in a cache; one camera for all images of a size, or none.
+    """Pairs of images whose features lie in a cache.
 
     Attributes:
-        K: (3, 3) intrinsics of the images of ``K_size`` (width, height); all others are matched without.
+        K: (3, 3) intrinsics of the images of ``K_size`` (width, height), all others are matched without; or None.
+        exif: without ``K``, take the intrinsics that the EXIF of each image gives.
     """
 
     cache: FeatureCache
     pair_names: Sequence[tuple[str, str]]
     K: NDArray[np.float64] | None = None
     K_size: tuple[int, int] | None = None
+    exif: bool = True
 
     def pairs(self) -> Sequence[tuple[str, str]]:
         """Names of the images, relative to their folder."""
@@ -100,6 +102,8 @@ class FolderSource:
         features = self.cache.read(name)
         if features is None:
             return None
+        if self.K is None:
+            return features if self.exif else replace(features, K=None)
         return replace(features, K=self.K if features.image_size == self.K_size else None)
 
     def image(self, name: str) -> ImageFeatures | Unusable:
@@ -145,11 +149,12 @@ class FolderJob:
         images: the folder. pairs: names of images, relative to it.
         output: ``.db`` (COLMAP), ``.h5`` (hloc's matches; its features lie beside it as ``NAME.features.h5``) or
             ``.jsonl`` (one object per pair).
-        K: (3, 3) intrinsics of the images, in pixels, or None: the focal length is guessed. Images of another size than
-            most are matched without.
+        K: (3, 3) intrinsics of the images, in pixels, or None: they are those of ``exif``, or guessed. Images of
+            another size than most are matched without.
         detector, max_keypoints: as in :func:`mgca_filter.match_images`.
         cache: folder that keeps the features for other runs, or None: beside the output until the run is done.
         report: an HTML report of the run, or None.
+        exif: without ``K``, take the focal length that the EXIF of each image gives.
     """
 
     images: Path
@@ -160,6 +165,7 @@ class FolderJob:
     max_keypoints: int = 2000
     cache: Path | None = None
     report: Report | None = None
+    exif: bool = True
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Extract what the cache lacks, filter all pairs, write the output; a killed run goes on where it stopped.
@@ -170,7 +176,7 @@ class FolderJob:
         work = work_folder(self.output)
         journal = Journal(work / "journal.log")
         features = {"detector": self.detector, "max_keypoints": self.max_keypoints}
-        camera = {"K": None if self.K is None else self.K.tolist()}
+        camera = {"K": None if self.K is None else self.K.tolist(), "exif": self.exif}
         try:
             folder = {"images": str(self.images.resolve())}
             journal.begin({**folder, **features, **camera, **run_identity(filter_options)})
@@ -190,7 +196,7 @@ class FolderJob:
     def _source(self, cache: FeatureCache, names: Sequence[str]) -> tuple[FolderSource, list[str]]:
         """The pairs with their intrinsics, and what is odd about these."""
         if self.K is None:
-            return FolderSource(cache, self.pairs), []
+            return FolderSource(cache, self.pairs, exif=self.exif), []
         sizes = {name: size for name in names if (size := cache.size(name)) is not None}
         size, doubts = camera_size(self.K, sizes)
         return FolderSource(cache, self.pairs, self.K, size), doubts
@@ -205,7 +211,7 @@ class FolderJob:
             if self.output.suffix == ".db":
                 from .colmap import write_database
 
-                write_database(partial, names, read, rows)
+                write_database(partial, names, read, rows, "SIMPLE_RADIAL" if self.K is None else "PINHOLE")
             elif self.output.suffix == ".h5":
                 from .hloc import write_features, write_matches
 

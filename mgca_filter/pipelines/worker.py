@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..exif import exif_intrinsics
 from ..features import (
     ImageFeatures,
     attributes_of_matches,
@@ -26,6 +27,7 @@ from ..features import (
 )
 from ..images import decode_image
 from ..inputs.attributes import MatchAttributes
+from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
 from ..result import FilterResult, Status
 
@@ -128,21 +130,26 @@ class PairWorker:
         else:
             candidates, pairs = matches, np.asarray(matches)
             known = _known_of(image1, image2, pairs)
-        sizes: dict[str, Any] = {
-            "size1": image1.image_size,
-            "size2": image2.image_size,
-            "attributes": known,
-            "resolution": max(image1.resolution, image2.resolution),
-        }
+        pair = MatchPair(
+            image1.points,
+            image2.points,
+            candidates,
+            size1=image1.image_size,
+            size2=image2.image_size,
+            attributes=known,
+            resolution=max(image1.resolution, image2.resolution),
+        )
         if image1.K is not None and image2.K is not None:
-            result = self._filter.filter(image1.points, image2.points, candidates, K1=image1.K, K2=image2.K, **sizes)
+            known_cameras = replace(pair, K1=image1.K, K2=image2.K, stretch1=image1.stretch, stretch2=image2.stretch)
+            (result,) = self._filter.filter_many([known_cameras])
             if result.status is not Status.SUSPICIOUS_INTRINSICS:
                 return result, pairs
         # Without intrinsics, or with such as the matches contradict, F tells the matches apart.
-        return self._filter.filter(image1.points, image2.points, candidates, **sizes), pairs
+        return self._filter.filter_many([pair])[0], pairs
 
     def extract(self, name: str, encoded: bytes, detector: str, max_keypoints: int) -> tuple[str, ImageFeatures | None]:
-        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too).
+        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too), and K
+        where its EXIF knows the focal length.
 
         None in place of the features of a file that cannot be decoded.
         """
@@ -150,7 +157,8 @@ class PairWorker:
             image = decode_image(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         except ValueError:
             return name, None
-        return name, describe(image, create_detector(detector, max_keypoints))
+        features = describe(image, create_detector(detector, max_keypoints))
+        return name, replace(features, K=exif_intrinsics(encoded, (image.shape[1], image.shape[0])))
 
 
 def call_worker(filter_options: str, method: str, task: tuple[Any, ...]) -> Any:

@@ -15,6 +15,7 @@ import h5py
 import numpy as np
 import pytest
 from conftest import METADATA, build_model
+from exif_files import FOCAL_35MM, with_exif
 from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
@@ -341,6 +342,37 @@ def test_cameras_of_the_database_are_those_that_the_images_were_matched_with(ima
     assert not of["view00.png"].has_prior_focal_length
     assert of["view01.png"].has_prior_focal_length
     np.testing.assert_allclose(of["view02.png"].params, [512, 512, 320, 240])
+
+
+@pytest.fixture
+def photographs(tmp_path, views):
+    """Two views as JPEG whose EXIF knows a focal length, 512 px, and one whose EXIF does not."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for number, view in enumerate(views[:3]):
+        jpeg = cv2.imencode(".jpg", view.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        (folder / f"{number}.jpg").write_bytes(with_exif(jpeg, {FOCAL_35MM: 28} if number < 2 else {}))
+    return folder
+
+
+def test_the_focal_length_is_that_of_the_exif_data(photographs, tmp_path):
+    words = ["folder", str(photographs), "-q", "-o"]
+    assert cli.main([*words, str(tmp_path / "out.jsonl")]) == 0
+    calibrated = {(row["image1"], row["image2"]): row["calibrated"] for row in read_rows(tmp_path / "out.jsonl")}
+    assert calibrated == {("0.jpg", "1.jpg"): True, ("0.jpg", "2.jpg"): False, ("1.jpg", "2.jpg"): False}
+    assert cli.main([*words, str(tmp_path / "guess.jsonl"), "--no-exif"]) == 0
+    assert not any(row["calibrated"] for row in read_rows(tmp_path / "guess.jsonl"))
+
+
+def test_cameras_of_the_exif_data_have_a_prior_focal_length(photographs, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    assert cli.main(["folder", str(photographs), "-q", "-o", str(tmp_path / "out.db")]) == 0
+    with contextlib.closing(pycolmap.Database.open(tmp_path / "out.db")) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        of = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+    assert [of[f"{number}.jpg"].has_prior_focal_length for number in range(3)] == [True, True, False]
+    assert len(cameras) == 2
+    np.testing.assert_allclose(of["0.jpg"].params, [512, 320, 240, 0])
 
 
 def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path, expected):
