@@ -283,13 +283,14 @@ def test_sampled_pairs_come_from_all_scenes(tmp_path: Path):
 
 
 def test_predictions_hold_what_the_curves_need(tmp_path: Path, model_file: Path):
-    path = write_bundle(tmp_path / "hall.npz", [make_scene()])
+    hard = make_scene(right=120, wrong=280)  # needs the network
+    path = write_bundle(tmp_path / "hall.npz", [hard])
     method = parse_method("product", str(model_file))
     (one,) = predict([method], select_pairs(path))["product"]["hall"][0]
-    assert sum(one.counts.right) + sum(one.counts.wrong) == 200
+    assert sum(one.counts.right) + sum(one.counts.wrong) == 400
     assert one.paper is not None
     # logit = 8 (0.8 - ratio) > 2 means a ratio below 0.55
-    ratio = make_scene().attributes.ratio
+    ratio = hard.attributes.ratio
     distance_right = np.array(one.counts.right)
     assert distance_right.sum() >= 110
     assert one.paper[1] == pytest.approx((ratio < 0.55).sum() / distance_right.sum(), abs=0.1)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Scene, make_scene
-from fit_inputs import COEFFICIENTS, FOCAL, joined, normalized, plane_with_twin
+from fit_inputs import COEFFICIENTS, FOCAL, joined, normalized, permuted, plane_with_twin
 
 from mgca_filter.fit import choice
 from mgca_filter.fit.choice import COEFFICIENTS as LENGTHS
@@ -237,11 +237,12 @@ def test_confidence_is_a_probability_that_rises_with_the_evidence(rate) -> None:
 
 
 def test_a_rival_takes_confidence_away() -> None:
-    plane, _ = plane_with_twin(off_plane=0, wrong=0)
-    scene = joined(plane, make_scene(right=0, wrong=50))
-    twin = pose_from_essential(plane_with_twin()[1], normalized(scene), FOCAL)
+    scene, twin = plane_with_twin(off_plane=0, wrong=0)
+    R, t = pose_from_essential(twin, normalized(scene), FOCAL)
+    in_front = ~measure_residuals(normalized(scene), R[None], t[None], FOCAL).behind[0]
+    scene = joined(permuted(scene, np.flatnonzero(in_front)), make_scene(right=0, wrong=30))  # both poses see them
     alone = Hypotheses(scene.R[None], scene.t[None], np.zeros(1, dtype=int))
-    rivals = Hypotheses(np.stack([scene.R, twin[0]]), np.stack([scene.t, twin[1]]), np.array([0, 0]))
+    rivals = Hypotheses(np.stack([scene.R, R]), np.stack([scene.t, t]), np.array([0, 0]))
     for rate in (confidence, early_confidence):
         values = [rate(judged(scene, poses, scores_of(scene)), COEFFICIENTS) for poses in (alone, rivals)]
         assert values[1] < values[0]
