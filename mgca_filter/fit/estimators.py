@@ -26,6 +26,7 @@ _PRESETS = {
     "prosac": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
     "magsac": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MAGSAC, cv2.LOCAL_OPTIM_SIGMA, 10, 14),
     "homography": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
+    "homography in order": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
 }
 # For F OpenCV's USAC_MAGSAC optimises on larger samples.
 _MAGSAC_FUNDAMENTAL_LO_SAMPLE = 50
@@ -159,17 +160,21 @@ def usac_params(preset: str, threshold: float, confidence: float, max_iterations
     return params
 
 
-def fit_homography(points1: Array, points2: Array, threshold: float, seed: int = 0) -> Array | None:
+def fit_homography(
+    points1: Array, points2: Array, threshold: float, seed: int = 0, ordered: bool = False
+) -> Array | None:
     """Homography (3, 3) with ``p2 ~ H p1`` of points (N, 2), scaled to H[2, 2] = 1, or None.
 
     Args:
         threshold: transfer error of an inlier, in the unit of the points. seed: of the sampling.
+        ordered: the most promising points come first, and are drawn first.
     """
     if len(points1) < 4:
         return None
     # OpenCV holds some constants in pixels: in units of the threshold, any coordinates look like pixels to it.
     scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
-    params = usac_params("homography", 1.0, _HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS, seed)
+    preset = "homography in order" if ordered else "homography"
+    params = usac_params(preset, 1.0, _HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS, seed)
     try:
         H, _ = _find_homography(points1 / threshold, points2 / threshold, params)
     except cv2.error:
