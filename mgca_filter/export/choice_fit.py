@@ -45,7 +45,7 @@ FOLDS = 5
 KINDS = ("raw", "cross", "ratio", "cross and ratio")
 CROSS_RATIO, PLAIN_RATIO = 0.8, 0.75
 # "ok" is said from the confidence on at which this share is right, and nothing below the second, which is chance's.
-OK_PRECISION, LEAST_CONFIDENCE = 0.965, 0.1
+OK_PRECISION, LEAST_CONFIDENCE = 0.96, 0.1
 # Of the poses that the bundles of a scene vouch for, so many of the easy ones agree with them (``QUALITY.csv``).
 LEAST_QUALITY = 0.92
 PLAUSIBLE_FOCAL_FACTOR = 0.9
