@@ -308,7 +308,11 @@ class _Pair:
         funnel = [
             ("raw", len(result.mask), "putative matches that came in"),
             ("candidates", info.get("num_network_matches") if asked else None, "of them went through the network"),
-            ("accepted", accepted, "of those it takes for right" if asked else "of them agree with what they explain alone"),
+            (
+                "accepted",
+                accepted,
+                "of those it takes for right" if asked else "of them agree with what they explain alone",
+            ),
             (
                 "supporting",
                 None if accepted is None else info.get("support"),

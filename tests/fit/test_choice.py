@@ -177,7 +177,9 @@ def test_features_have_the_names_that_the_coefficients_belong_to(scene: Scene) -
 
 
 def test_a_coarse_detector_is_measured_on_its_own_scale() -> None:
-    scales = [judged(s, with_truth(s), scores_of(s)).scale for s in (make_scene(noise_px=0.2), make_scene(noise_px=1.2))]
+    scales = [
+        judged(s, with_truth(s), scores_of(s)).scale for s in (make_scene(noise_px=0.2), make_scene(noise_px=1.2))
+    ]
     assert scales == sorted(COEFFICIENTS["noise_scales"])
 
 

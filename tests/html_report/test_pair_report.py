@@ -76,7 +76,9 @@ def many_matches(count: int, kept: int) -> FilterResult:
     points = rng.uniform(0, 480, (2, count, 2))
     scores = rng.uniform(0, 1, count).astype(np.float32)
     F = np.random.default_rng(1).normal(size=(3, 3))
-    return FilterResult(mask, scores, np.zeros((kept, 2), np.intp), None, F, None, None, None, Status.OK, kept, None, *points)
+    return FilterResult(
+        mask, scores, np.zeros((kept, 2), np.intp), None, F, None, None, None, Status.OK, kept, None, *points
+    )
 
 
 @pytest.mark.parametrize(("kept", "shown_kept"), [(500, 500), (25_000, MAX_MATCHES_SHOWN)])
@@ -223,7 +225,9 @@ def test_a_result_shows_its_verdict_in_a_notebook(result):
     assert f"{result.num_inliers} of 120 matches" in text
     assert "<img" not in text
     nothing = dict.fromkeys(("E", "F", "R", "t", "H"))
-    few = FilterResult(np.zeros(0, bool), np.zeros(0, np.float32), [], **nothing, status=Status.UNRELATED, num_inliers=0)
+    few = FilterResult(
+        np.zeros(0, bool), np.zeros(0, np.float32), [], **nothing, status=Status.UNRELATED, num_inliers=0
+    )
     assert "rotation" not in few._repr_html_()
 
 
