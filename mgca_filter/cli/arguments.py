@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inputs.options import METHODS
+from ..inputs.options import METHODS, FilterOptions
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
 
@@ -47,7 +47,10 @@ def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = 
     )
     methods = [method for method in METHODS if method != "none" or not fit_required]
     scores_alone = "" if fit_required else "; none = scores alone"
-    group.add_argument("--method", choices=methods, default="prosac", help=f"robust fit, default prosac{scores_alone}")
+    default = FilterOptions.method
+    group.add_argument(
+        "--method", choices=methods, default=default, help=f"robust fit, default {default}{scores_alone}"
+    )
     group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
     group.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
     group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")

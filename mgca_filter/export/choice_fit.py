@@ -205,8 +205,8 @@ def describe_verdicts(p: Array, right: NDArray[np.bool_], least: float, usable: 
     """What the two limits of the confidence do, in a line."""
     said, withheld = p >= usable, p < least
     return (
-        f"ok from {usable:.2f}: {100.0 * right[said].mean():.1f} % of these right, {100.0 * said[right].mean():.1f} % of "
-        f"the right ones; withheld below {least}: {100.0 * withheld[right].mean():.2f} % of the right ones, "
+        f"ok from {usable:.2f}: {100.0 * right[said].mean():.1f} % of these right, {100.0 * said[right].mean():.1f} % "
+        f"of the right ones; withheld below {least}: {100.0 * withheld[right].mean():.2f} % of the right ones, "
         f"{100.0 * withheld[~right].mean():.1f} % of the wrong ones"
     )
 
