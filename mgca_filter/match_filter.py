@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
+from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focal
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge, judge_homography
 from .geometry.cameras import Fisheye
+from .geometry.epipolar import project_to_essential
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import (
@@ -184,6 +186,7 @@ class MatchFilter:
         if job.model is None:
             logits, scores = self._score(job)
             self._fit(job, logits, scores)
+            pair = job.pair  # under another focal length now, where that was estimated
         else:
             logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
@@ -195,6 +198,8 @@ class MatchFilter:
                 verdict = judge_homography(pair, job.evidence, threshold_px, self.options)
             else:
                 verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
+            if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
+                verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
             found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
             if self.options.keep_precision is not None and found:
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
@@ -238,7 +243,25 @@ class MatchFilter:
         job.evidence = gather_scored(job.pair, job.sent.rows, scores, margins, job.network_essential)
         if job.search is not None:
             job.model = job.search.with_network(job.evidence)
+        if job.model is not None and not job.given and self.options.geometry == "auto":
+            self._fit_under_estimated_focal(job, scores, margins)
         job.timings_ms["fit"] += _milliseconds_since(started)
+
+    def _fit_under_estimated_focal(self, job: _Job, scores: NDArray[np.float32], margins: NDArray[np.float32]) -> None:
+        """A second fit, of an essential matrix, where the matches tell the focal length that was guessed."""
+        assert job.model is not None
+        assert job.evidence is not None
+        assert job.sent is not None
+        estimate = estimate_focal(job.evidence, job.model.M)
+        if estimate is None:
+            return
+        pair, zoom = job.pair.with_focal(estimate.factor), np.diag([estimate.factor, estimate.factor, 1.0])
+        E = None if job.network_essential is None else project_to_essential(zoom @ job.network_essential @ zoom)
+        evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
+        search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
+        model = search.with_network(evidence)
+        if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
+            job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
 
     def _score_by_residuals(
         self, pair: PairInput, model: TwoViewModel
@@ -256,6 +279,21 @@ class MatchFilter:
         kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.options.keep_precision)
         return kept
 
+    def _describe_cameras(self, job: _Job) -> dict[str, Any]:
+        """Where the intrinsics come from, and what was assumed."""
+        assumptions = list(job.pair.assumptions)
+        if job.focal is None:
+            return {"intrinsics": "given" if job.given else "guessed", "assumptions": assumptions}
+        focal_px = job.pair.focal_px / job.pair.unit_px
+        accuracy = f"to {100 * job.focal.sigma:.0f} %"
+        assumptions.append(f"focal length {focal_px:.0f} px of both images estimated from the matches, {accuracy}")
+        return {
+            "intrinsics": "estimated",
+            "assumptions": assumptions,
+            "focal_px": focal_px,
+            "focal_sigma": job.focal.sigma,
+        }
+
     def _describe(self, job: _Job) -> dict[str, Any]:
         job.timings_ms["total"] = sum(job.timings_ms.values())
         return {
@@ -263,8 +301,7 @@ class MatchFilter:
             "backend": self._backend.name,
             "model": self._backend.metadata.name,
             "model_sha256": self._backend.metadata.sha256,
-            "intrinsics": "given" if job.given else "guessed",
-            "assumptions": list(job.pair.assumptions),
+            **self._describe_cameras(job),
             "num_network_matches": 0 if job.sent is None else len(job.sent.rows),
             "network_rows": np.zeros(0, dtype=np.intp) if job.sent is None else job.sent.rows,
             "network_essential": job.network_essential,
@@ -286,6 +323,7 @@ class _Job:
     model: TwoViewModel | None = None
     sent: NetworkInput | None = None
     output: NetworkOutput | None = None
+    focal: FocalEstimate | None = None
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:

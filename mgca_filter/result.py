@@ -60,7 +60,8 @@ class FilterResult:
         points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
-            ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
+            ``intrinsics`` ("given", "estimated" with ``focal_px`` and ``focal_sigma``, its relative
+            standard deviation, or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
             ``network_rows`` (those that entered the network), ``num_accepted`` (those above the decision threshold),
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
             robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",

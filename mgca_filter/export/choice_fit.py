@@ -205,8 +205,8 @@ def describe_verdicts(p: Array, right: NDArray[np.bool_], least: float, usable: 
     """What the two limits of the confidence do, in a line."""
     said, withheld = p >= usable, p < least
     return (
-        f"ok from {usable:.2f}: {100.0 * right[said].mean():.1f} % of these right, {100.0 * said[right].mean():.1f} % of "
-        f"the right ones; withheld below {least}: {100.0 * withheld[right].mean():.2f} % of the right ones, "
+        f"ok from {usable:.2f}: {100.0 * right[said].mean():.1f} % of these right, {100.0 * said[right].mean():.1f} % "
+        f"of the right ones; withheld below {least}: {100.0 * withheld[right].mean():.2f} % of the right ones, "
         f"{100.0 * withheld[~right].mean():.1f} % of the wrong ones"
     )
 
@@ -232,6 +232,24 @@ def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Samp
         for name, matches in unrelated_pairs(options.photos, options.unrelated, options.seed):
             samples += samples_of(matches, None, f"unrelated {name}", match_filter)
     return samples
+
+
+def save_samples(path: Path, samples: Sequence[Sample]) -> None:
+    """Write samples, for a second fit to the same."""
+    width = len(FEATURES)
+    features = np.stack([np.pad(sample.features, (0, width - len(sample.features))) for sample in samples])
+    facts = {name: np.array([getattr(sample, name) for sample in samples]) for name in ("right", "group", "early")}
+    np.savez_compressed(path, features=features, **facts)  # type: ignore[arg-type]  # its stub takes names for options
+
+
+def load_samples(path: Path) -> list[Sample]:
+    """What :func:`save_samples` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        columns = zip(data["features"], data["right"], data["group"], data["early"])
+        return [
+            Sample(row[: len(EARLY_FEATURES) if early else len(FEATURES)], bool(right), str(group), bool(early))
+            for row, right, group, early in columns
+        ]
 
 
 def fit(samples: Sequence[Sample], early: bool) -> tuple[list[float], Array, NDArray[np.bool_]]:
@@ -274,12 +292,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--exclude", nargs="*", default=[], metavar="SCENE", help="scenes of doubtful poses")
     parser.add_argument("--model", type=Path, default=model_path(), help="whose scores are used")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    parser.add_argument(
+        "--samples", type=Path, metavar="FILE.npz", help="keep what was measured here, or take it from it"
+    )
     parser.add_argument("--write", action="store_true", help="put the coefficients into the model file as well")
     options = parser.parse_args(arguments)
     coefficients = choice.fitted_coefficients()
-    if options.bundles:
+    samples: list[Sample] = []
+    if options.samples is not None and options.samples.is_file():
+        samples = load_samples(options.samples)
+    elif options.bundles:
         with one_thread():
             samples = collect(options, MatchFilter(model=options.model, effort="full"))
+        if options.samples is not None:
+            save_samples(options.samples, samples)
+    if samples:
         for name, early in (("confidence", False), ("early_confidence", True)):
             coefficients[name], p, right = fit(samples, early)
             error = expected_calibration_error(p, right)

@@ -124,7 +124,9 @@ def resolve_intrinsics(
             raise ValueError(f"{name}: distortion coefficients need {needed}")
     sizes = (_read_size(size1, "size1"), _read_size(size2, "size2"))
     if K1 is None:
-        return _guess(points1, sizes[0], 1), _guess(points2, sizes[1], 2)
+        # Where no size is known, one camera is likelier than two, and the larger extent says more of it.
+        shared = max(max(_box(points)[1]) for points in (points1, points2)) if sizes == (None, None) else None
+        return _guess(points1, sizes[0], 1, shared), _guess(points2, sizes[1], 2, shared)
     first = Intrinsics(_read_K(K1, "K1"), _read_distortion(dist1, "dist1"), guessed=False)
     if K2 is None:
         distortion2 = first.distortion if dist2 is None else _read_distortion(dist2, "dist2")
@@ -171,18 +173,26 @@ def _undistort_fisheye(points: NDArray[np.float64], K: NDArray[np.float64], lens
     return np.where(reached[:, None], normalized[:, 0], np.nan)
 
 
-def _guess(points: NDArray[np.float64], size: tuple[float, float] | None, image: int) -> Intrinsics:
+def _box(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Corner (2,) and (width, height) of the image that keypoints (N, 2) seem to come from."""
+    usable = points[(np.abs(points) < _LARGEST_PX).all(axis=1)]
+    usable = usable if len(usable) else np.zeros((1, 2))
+    # Points left of or above the image say that its corner is not the origin: the middle is that of the points.
+    corner = np.where(usable.min(axis=0) < -_OUTSIDE_SHARE * np.ptp(usable, axis=0), usable.min(axis=0), 0.0)
+    width, height = np.max(usable, axis=0) - corner + 1.0
+    return corner, (max(float(width), 1.0), max(float(height), 1.0))
+
+
+def _guess(
+    points: NDArray[np.float64], size: tuple[float, float] | None, image: int, longer_side: float | None
+) -> Intrinsics:
+    """A usual lens on an image of ``size``, or of the keypoints' extent; ``longer_side`` where both images tell it."""
     source = "the image size"
     corner = np.zeros(2)
     if size is None:
-        usable = points[(np.abs(points) < _LARGEST_PX).all(axis=1)]
-        usable = usable if len(usable) else np.zeros((1, 2))
-        # Points left of or above the image say that its corner is not the origin: the middle is that of the points.
-        corner = np.where(usable.min(axis=0) < -_OUTSIDE_SHARE * np.ptp(usable, axis=0), usable.min(axis=0), 0.0)
-        width, height = np.max(usable, axis=0) - corner + 1.0
-        size = (max(float(width), 1.0), max(float(height), 1.0))
+        corner, size = _box(points)
         source = "the extent of the keypoints"
-    focal = GUESSED_FOCAL_FACTOR * max(size)
+    focal = GUESSED_FOCAL_FACTOR * (max(size) if longer_side is None else longer_side)
     cx, cy = corner + (np.array(size) - 1.0) / 2.0
     K = np.array([[focal, 0.0, cx], [0.0, focal, cy], [0.0, 0.0, 1.0]])
     return Intrinsics(K, None, True, f"focal length {focal:.0f} px of image {image} guessed from {source}")

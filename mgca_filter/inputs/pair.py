@@ -115,6 +115,18 @@ class PairInput:
         stretch1, stretch2 = (None if s is None else s[rows] for s in (self.stretch1, self.stretch2))
         return sampson_distance(self.correspondences[rows], E, stretch1, stretch2) * self.focal_px
 
+    def with_focal(self, factor: float) -> PairInput:
+        """The pair under the guessed focal length times ``factor``, taken for the truth from now on."""
+        zoom = np.diag([factor, factor, 1.0])
+        cameras = []
+        for camera in (self.intrinsics1, self.intrinsics2):
+            K = camera.K.copy()
+            K[:2, :2] = K[:2, :2] @ zoom[:2, :2]
+            cameras.append(replace(camera, K=K, guessed=False))
+        return replace(
+            self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
+        )
+
     def threshold_px(self, threshold: float) -> float:
         """The caller's threshold in pixels of the image in which the keypoints were found."""
         return threshold if threshold > self.largest_threshold else threshold * self.unit_px
