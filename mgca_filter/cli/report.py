@@ -81,7 +81,7 @@ class MatchReport:
 
     @property
     def intrinsics(self) -> str:
-        """``"given"``, ``"exif"`` or ``"guessed"``."""
+        """``"given"``, ``"exif"``, ``"estimated"`` or ``"guessed"``."""
         return "exif" if self.by_exif else str(self.result.info.get("intrinsics"))
 
     @property

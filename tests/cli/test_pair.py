@@ -260,7 +260,7 @@ def test_the_focal_length_is_that_of_the_exif_data(photographs, capsys):
     np.testing.assert_allclose(exif["K1"], [[focal, 0, 511.5], [0, focal, 383.5], [0, 0, 1]])
     truth = json.loads((IMAGES / "pair.json").read_text())
     assert pose_error_deg(exif["R"], exif["t"], truth["R"], truth["t"]) < 2.0
-    assert found("-q", "--no-exif")["intrinsics"] == "guessed"
+    assert found("-q", "--no-exif")["intrinsics"] in ("estimated", "guessed")
     assert found("-q", "--K", K_WORDS)["intrinsics"] == "given"
     assert cli.main(photographs) == 0
     assert "focal lengths 819 and 819 px, from EXIF data" in capsys.readouterr().out
@@ -268,7 +268,7 @@ def test_the_focal_length_is_that_of_the_exif_data(photographs, capsys):
 
 def test_exif_data_of_one_photograph_are_no_pair_of_cameras(photographs, capsys):
     assert cli.main([photographs[0], RIGHT, "-q", "--json", "-"]) == 0
-    assert json.loads(capsys.readouterr().out)["intrinsics"] == "guessed"
+    assert json.loads(capsys.readouterr().out)["intrinsics"] in ("estimated", "guessed")
 
 
 def test_exif_data_that_the_matches_contradict_are_left(photographs, monkeypatch, capsys):
@@ -282,7 +282,7 @@ def test_exif_data_that_the_matches_contradict_are_left(photographs, monkeypatch
     monkeypatch.setattr(pair, "match_images", match)
     assert cli.main([*photographs, "--json", "-"]) == 0
     out, err = capsys.readouterr()
-    assert json.loads(out)["intrinsics"] == "guessed"
+    assert json.loads(out)["intrinsics"] in ("estimated", "guessed")
     assert "the matches contradict the focal length of the EXIF data" in err
 
 

@@ -51,7 +51,7 @@ def test_rows_equal_match_images(image_folder, views, expected):
     assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
     for row in rows:
         view1, view2 = (next(v for v in views if v.name == row[key]) for key in ("image1", "image2"))
-        alone = match_images(view1.image, view2.image, K1=view1.K, method="prosac")
+        alone = match_images(view1.image, view2.image, K1=view1.K)
         assert row["status"] == alone.result.status.value
         assert row["confidence"] == alone.result.confidence
         assert row["num_inliers"] == alone.result.num_inliers == len(row["points1"]) == len(row["scores"])
@@ -71,7 +71,7 @@ def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
     words = ["--K", f"{fx},{fy},{cx},{cy}", "-q"]
     assert cli.main(["folder", str(tmp_path / "images"), "-o", str(tmp_path / "out.jsonl"), *words]) == 0
     (row,) = read_rows(tmp_path / "out.jsonl")
-    alone, strict = (match_images(*large, K1=K, method="prosac", **options) for options in ({}, {"resolution": 1.0}))
+    alone, strict = (match_images(*large, K1=K, **options) for options in ({}, {"resolution": 1.0}))
     assert row["num_inliers"] == alone.result.num_inliers > strict.result.num_inliers
 
 

@@ -86,7 +86,7 @@ def test_the_filter_sees_the_files_as_they_are(tmp_path, views, raw_matches):
         kept = file[NAMES[0].replace("/", "-")][NAMES[1].replace("/", "-")]["matches0"][()] > -1
     rows = raw_matches[0, 1][np.argsort(raw_matches[0, 1][:, 0])]
     points = [view.points.astype(np.float32) for view in views]
-    result = MatchFilter(threshold=2.0, method="prosac").filter(points[0], points[1], rows, size1=size, size2=size)
+    result = MatchFilter(threshold=2.0).filter(points[0], points[1], rows, size1=size, size2=size)
     assert np.array_equal(np.flatnonzero(kept), rows[result.mask, 0])
 
 
