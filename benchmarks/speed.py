@@ -3,6 +3,9 @@
 All calls run in turn in one process, on as many threads, on the raw SIFT matches of the example pair (or of a pair of
 a scene bundle); medians. Whole calls have the pose error of their answer beside them. Cold start and memory are
 measured in processes of their own. ``benchmarks.profile_network`` tells where the milliseconds of the network go.
+
+``--bundles FOLDER …`` prints another table instead: on one thread, the whole call on the lists that users make of the
+matches, as a multiple of USAC_MAGSAC's 5000 iterations on the same list.
 """
 
 from __future__ import annotations
@@ -13,7 +16,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,17 +25,24 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from mgca_filter import BackendError, FilterResult, MatchFilter, match_images, model_path
-from mgca_filter.data.scene_bundle import SceneBundle
+from mgca_filter.data.scene_bundle import SceneBundle, ScenePair
 from mgca_filter.data.source import read_image
+from mgca_filter.evaluation.environment import CpuMeter, one_thread
 from mgca_filter.evaluation.metrics import FAILURE_DEG, true_matches
+from mgca_filter.evaluation.pairs import sample_pairs
+from mgca_filter.fit.evidence import MIN_MATCHES
 from mgca_filter.fit.robust_fit import pose_from_essential
 from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
 from mgca_filter.inference import open_backend
 from mgca_filter.inference.onnxruntime_ import THREADS_VARIABLE
 from mgca_filter.tables import MISSING, markdown_head, markdown_row, render_table
+
+from .match_lists import KINDS, RAW, DetectorScene, open_detector_scenes
+from .study import match_pair
 
 FloatArray = NDArray[np.float64]
 
@@ -111,11 +121,13 @@ def bundle_pair(path: Path, index: int) -> RawPair:
     return RawPair(arguments, pair.attributes, pair.points1, pair.points2, pair.K1, pair.K2, pair.R, pair.t)
 
 
-def magsac(pair: RawPair, iterations: int) -> Any:
-    """The call that the filter replaces, at one pixel: E and mask."""
+def magsac(
+    pair: RawPair | ScenePair, iterations: int, threshold_px: float = 1.0, confidence: float = 0.999
+) -> tuple[Any, Any]:
+    """The call that the filter replaces, at one pixel unless told otherwise: E and mask."""
     x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
-    threshold = 1.0 / mean_focal_length(pair.K1, pair.K2)
-    return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, 0.999, threshold, iterations)
+    threshold = threshold_px / mean_focal_length(pair.K1, pair.K2)
+    return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, confidence, threshold, iterations)
 
 
 def answer_error_deg(pair: RawPair, answer: Any) -> float | None:
@@ -229,14 +241,111 @@ def print_cold_start_and_memory(names: list[str]) -> None:
         print(markdown_row([name, *cells]))
 
 
-def main() -> None:
+@dataclass(frozen=True)
+class ListTime:
+    """Times of one list: of the filter's whole call, and of USAC_MAGSAC at half a pixel, medians of several.
+
+    ``with_network`` is False where the search ended before the network; ``right_share`` is 0 … 1.
+    """
+
+    family: str
+    matches: int
+    right_share: float
+    with_network: bool
+    filter_ms: float
+    magsac_ms: float
+
+    @property
+    def group(self) -> str:
+        """The one of :data:`RATIO_TARGETS` that the list belongs to."""
+        if self.family == RAW:
+            return RAW_NETWORK if self.with_network else RAW_EARLY
+        low, high = CLEAR_COUNTS
+        return CLEAR if low <= self.matches <= high and self.right_share >= CLEAR_SHARE else FILTERED
+
+
+CLEAR_COUNTS, CLEAR_SHARE = (200, 1500), 0.7
+RAW_NETWORK, RAW_EARLY, CLEAR, FILTERED = (
+    *("raw, network needed", "raw, ended before the network"),
+    *("filtered, 200 to 1500 matches, from 70 % right", "filtered, others"),
+)
+RATIO_TARGETS = {RAW_NETWORK: "0.6", RAW_EARLY: MISSING, CLEAR: "2", FILTERED: "5"}
+"""Groups of lists, and the ratio to MAGSAC's time that none should pass."""
+
+
+def time_lists(scenes: Sequence[DetectorScene], repeats: int, model: str | None = None) -> list[ListTime]:
+    """Times on every kind of list of every pair; lists of fewer than eight matches are left out."""
+    match_filter = MatchFilter(model=model, backend="onnxruntime")
+    times = []
+    for scene in tqdm(scenes, disable=None, unit=" bundles"):
+        selections = [(kind, selection) for kind in KINDS.values() if (selection := scene.lists(kind)) is not None]
+        for kind, selection in selections:
+            for pair in sample_pairs([selection], len(selection)):
+                if len(pair.points1) < MIN_MATCHES:
+                    continue
+                given = match_pair(pair)
+                calls: dict[str, Callable[[], Any]] = {
+                    "filter": partial(match_filter.filter_many, [given]),
+                    "magsac": partial(magsac, pair, 5000, 0.5, 0.9999),
+                }
+                ms = median_ms(calls, repeats)
+                truth = true_matches(pair.correspondences, pair.E)
+                with_network = match_filter.filter_many([given])[0].info["num_network_matches"] > 0
+                facts = (kind.family, len(truth), float(truth.mean()), with_network)
+                times.append(ListTime(*facts, ms["filter"], ms["magsac"]))
+    return times
+
+
+def ratio_table(times: Sequence[ListTime]) -> str:
+    """A row for each group that has a list: medians, and the ratios of the medians and of the sums of the times."""
+    rows = []
+    for group, target in RATIO_TARGETS.items():
+        chosen = [one for one in times if one.group == group]
+        if not chosen:
+            continue
+        ours, theirs = (np.array([getattr(one, f"{name}_ms") for one in chosen]) for name in ("filter", "magsac"))
+        matches, right = (float(np.median([getattr(one, n) for one in chosen])) for n in ("matches", "right_share"))
+        ratios = (np.median(ours) / np.median(theirs), np.median(ours / theirs), ours.sum() / theirs.sum())
+        cells = [group, str(len(chosen)), f"{matches:.0f}", f"{100 * right:.0f} %"]
+        cells += [f"{np.median(ours):.1f}", f"{np.median(theirs):.1f}"]
+        rows.append([*cells, *(f"{ratio:.2f}" for ratio in ratios), target])
+    header = ["lists", "number", "matches", "right", "filter, ms", "MAGSAC, ms"]
+    header += ["ratio of medians", "median of ratios", "ratio of sums", "target"]
+    return render_table(header, rows)
+
+
+def print_list_ratios(options: argparse.Namespace) -> None:
+    """The table of ``--bundles``."""
+    chosen = (options.detectors, None, options.per_scene)
+    scenes = open_detector_scenes(options.bundles, *chosen)
+    meter = CpuMeter()
+    with one_thread():
+        times = time_lists(scenes, options.repeats, options.model)
+    print(
+        "Whole calls against USAC_MAGSAC (0.5 px, confidence 0.9999, 5000 iterations) on the same list, one thread, in "
+        f"turn, medians; other programs used {meter.others_load():.1f} processors meanwhile.\n\n{ratio_table(times)}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print all tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--bundle", type=Path, help="a scene bundle instead of the example pair")
     parser.add_argument("--pair", type=int, default=0, help="index in the bundle")
-    options = parser.parse_args()
+    parser.add_argument(
+        "--bundles", type=Path, nargs="+", metavar="FOLDER", help="ratios on the lists of these bundles"
+    )
+    parser.add_argument("--per-scene", type=int, metavar="N", help="with --bundles: at most N pairs of each")
+    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="with --bundles: these alone")
+    parser.add_argument(
+        "--model", metavar="FILE", help="with --bundles: of the filter (default: the one in the package)"
+    )
+    options = parser.parse_args(arguments)
+    if options.bundles:
+        print_list_ratios(options)
+        return
     os.environ[THREADS_VARIABLE] = os.environ["OMP_NUM_THREADS"] = str(options.threads)
     cv2.setNumThreads(options.threads)
     import torch

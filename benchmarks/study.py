@@ -10,6 +10,7 @@ from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.errors import MgcaFilterError
 from mgca_filter.evaluation.environment import one_thread
 from mgca_filter.evaluation.metrics import FAILURE_DEG, FloatArray, Statistic, paired_bootstrap_interval
+from mgca_filter.evaluation.our_rows import scored_matches
 from mgca_filter.evaluation.pairs import SceneSelection, select_pairs
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.pair import MatchPair
@@ -46,9 +47,10 @@ def drawn_pairs(options: argparse.Namespace) -> list[SceneSelection]:
 
 
 def match_pair(pair: ScenePair) -> MatchPair:
-    """The raw matches of a pair as the filter takes them, with intrinsics, image sizes and attributes."""
+    """The matches of a pair as the filter takes them, with intrinsics, image sizes, attributes and scores if any."""
     cameras = (pair.K1, pair.K2, None, None, pair.image_size1, pair.image_size2)
-    return MatchPair(pair.points1, pair.points2, None, *cameras, pair.attributes)
+    matches = None if pair.match_scores is None else scored_matches(pair.match_scores)
+    return MatchPair(pair.points1, pair.points2, matches, *cameras, pair.attributes)
 
 
 def result_error_deg(result: FilterResult, pair: ScenePair) -> float:

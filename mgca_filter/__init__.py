@@ -6,6 +6,7 @@ Matplotlib; ONNX Runtime is loaded when the first model is opened.
 """
 
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
+from .geometry.cameras import Fisheye
 from .inputs.attributes import MatchAttributes
 from .inputs.pair import MatchPair
 from .match_filter import MatchFilter, filter_many, filter_matches, model_path
@@ -27,6 +28,7 @@ __all__ = [
     "BackendError",
     "BundleError",
     "FilterResult",
+    "Fisheye",
     "ImageMatchResult",
     "MatchAttributes",
     "MatchFilter",

@@ -34,6 +34,8 @@ class ImageFeatures:
         descriptors: (N, D), or None.
         K: (3, 3) intrinsics, or None.
         image_size: (width, height) in pixels, or None.
+        resolution: pixels of the image per pixel of the copy in which the keypoints were found.
+        stretch: (N, 2, 2) derivatives of ``points`` by the distorted pixels that they were found at, or None.
     """
 
     points: NDArray[Any]
@@ -42,16 +44,19 @@ class ImageFeatures:
     descriptors: NDArray[Any] | None = None
     K: NDArray[np.float64] | None = None
     image_size: tuple[int, int] | None = None
+    resolution: float = 1.0
+    stretch: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.points)
 
     def take(self, rows: NDArray[np.intp]) -> ImageFeatures:
         """The keypoints of the given rows (n,) alone."""
-        size, angle, descriptors = (
-            None if field is None else field[rows] for field in (self.size, self.angle, self.descriptors)
+        size, angle, descriptors, stretch = (
+            None if field is None else field[rows] for field in (self.size, self.angle, self.descriptors, self.stretch)
         )
-        return replace(self, points=self.points[rows], size=size, angle=angle, descriptors=descriptors)
+        points = self.points[rows]
+        return replace(self, points=points, size=size, angle=angle, descriptors=descriptors, stretch=stretch)
 
 
 @dataclass(frozen=True)
@@ -90,6 +95,11 @@ def create_detector(name: str = "sift", feature_count: int = SIFT_FEATURE_COUNT)
         akaze: type[cv2.xfeatures2d.AKAZE] = getattr(cv2, "AKAZE", None) or cv2.xfeatures2d.AKAZE
         return akaze.create(max_points=feature_count)
     raise ValueError(f"detector: expected {', '.join(DETECTORS)} or a cv2.Feature2D, got {name!r}")
+
+
+def detector_resolution(image_size: tuple[int, int], max_side_px: int = DETECTOR_MAX_SIDE_PX) -> float:
+    """Pixels of an image (width, height) per pixel of the copy that :func:`detect_keypoints` looks at; 1 or more."""
+    return max(1.0, max(image_size) / max_side_px)
 
 
 def detect_keypoints(
@@ -199,6 +209,7 @@ def describe(image: NDArray[Any], detector: cv2.Feature2D, name: str = "image") 
         angle=values[:, 3].astype(np.float32),
         descriptors=descriptors,
         image_size=(image.shape[1], image.shape[0]),
+        resolution=detector_resolution((image.shape[1], image.shape[0])),
     )
 
 
@@ -210,7 +221,7 @@ def match_features(features1: ImageFeatures, features2: ImageFeatures) -> OneWay
     Raises:
         ValueError: an image has no descriptors, or the two images' differ in dtype or length.
     """
-    descriptors1, descriptors2 = _described(features1), _described(features2)
+    descriptors1, descriptors2 = descriptors_of(features1), descriptors_of(features2)
     count1, count2 = len(features1), len(features2)
     forth = read_matches(match_descriptors(descriptors1, descriptors2), count1, count2)
     back = read_matches(match_descriptors(descriptors2, descriptors1), count2, count1)
@@ -273,7 +284,12 @@ def descriptor_distances(
     return np.sqrt(np.maximum(matched, 0.0)), np.sqrt(np.maximum(other, 0.0))
 
 
-def _described(features: ImageFeatures) -> NDArray[Any]:
+def descriptors_of(features: ImageFeatures) -> NDArray[Any]:
+    """Descriptors (N, D) of an image.
+
+    Raises:
+        ValueError: it has none.
+    """
     if features.descriptors is None:
         raise ValueError("no matches, and no descriptors to find them with")
     return features.descriptors

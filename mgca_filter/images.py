@@ -1,8 +1,6 @@
-"""Image files: from their bytes to pixels, and whether intrinsics can be those of images of a size."""
+"""Image files: from their bytes to pixels, and what speaks against intrinsics of an image."""
 
 from __future__ import annotations
-
-from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -49,19 +47,9 @@ def _eight_bits(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return np.asarray(cv2.convertScaleAbs(raised, alpha=255.0 / max(1, high - low)), dtype=np.uint8)
 
 
-def intrinsics_doubts(K: NDArray[np.float64], sizes: Iterable[tuple[int, int]]) -> list[str]:
-    """What speaks against ``K`` (3, 3) being the intrinsics of images of these sizes (width, height), in pixels; one
-    line each, none where nothing does."""
-    distinct = sorted(set(sizes))
-    names = [f"{width} x {height}" for width, height in distinct]
-    doubts = []
-    if len(distinct) > 1:
-        few = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
-        doubts.append(
-            f"one K for images of {len(names)} sizes ({few}): intrinsics are those of one size and orientation"
-        )
-    for name, size in zip(names, distinct):
-        x, y = K[:2, 2] / size
-        if not (_MIDDLE[0] <= x <= _MIDDLE[1] and _MIDDLE[0] <= y <= _MIDDLE[1]):
-            doubts.append(f"the principal point {K[0, 2]:g},{K[1, 2]:g} is far from the middle of an image of {name}")
-    return doubts
+def principal_point_doubt(K: NDArray[np.float64], size: tuple[int, int]) -> str | None:
+    """What speaks against ``K`` (3, 3) being the intrinsics of an image of (width, height) pixels, or None."""
+    x, y = K[:2, 2] / size
+    if _MIDDLE[0] <= x <= _MIDDLE[1] and _MIDDLE[0] <= y <= _MIDDLE[1]:
+        return None
+    return f"the principal point {K[0, 2]:g},{K[1, 2]:g} is far from the middle of an image of {size[0]} x {size[1]}"

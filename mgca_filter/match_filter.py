@@ -12,8 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
+from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focal
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
-from .fit.verdict import Verdict, count_distinct, judge
+from .fit.verdict import Verdict, count_distinct, judge, judge_homography
+from .geometry.cameras import Fisheye
+from .geometry.epipolar import project_to_essential
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
 from .inference.scoring import (
@@ -44,8 +47,8 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold, keep_precision, confidence, method, effort, max_iterations, model, providers, backend, seed: as in
-            :func:`filter_matches`.
+        threshold, keep_precision, confidence, method, effort, geometry, max_iterations, model, providers, backend,
+            seed: as in :func:`filter_matches`.
 
     Raises:
         TypeError, ValueError: an option is not one of the above.
@@ -62,6 +65,7 @@ class MatchFilter:
         confidence: float = FilterOptions.confidence,
         method: str | int = FilterOptions.method,
         effort: str = FilterOptions.effort,
+        geometry: str = FilterOptions.geometry,
         max_iterations: int = FilterOptions.max_iterations,
         model: str | Path | None = None,
         providers: Providers | None = None,
@@ -75,6 +79,7 @@ class MatchFilter:
             confidence=confidence,
             method=method_name(method),
             effort=effort,
+            geometry=geometry,
             max_iterations=max_iterations,
             seed=seed,
         )
@@ -101,16 +106,18 @@ class MatchFilter:
         *,
         K1: MatrixLike | None = None,
         K2: MatrixLike | None = None,
-        dist1: ArrayLike | None = None,
-        dist2: ArrayLike | None = None,
+        dist1: ArrayLike | Fisheye | None = None,
+        dist2: ArrayLike | Fisheye | None = None,
         size1: SizeLike | None = None,
         size2: SizeLike | None = None,
         attributes: MatchAttributes | None = None,
         K: MatrixLike | None = None,
+        resolution: float = 1.0,
     ) -> FilterResult:
         """Filter the matches of one pair; arguments, result and errors as in :func:`filter_matches`."""
         K1 = _shared_intrinsics(K, K1, K2)
-        return self.filter_many([MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)])[0]
+        pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes, resolution)
+        return self.filter_many([pair])[0]
 
     @np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
     def filter_many(self, pairs: Iterable[MatchPair | tuple[Any, Any, Any]]) -> list[FilterResult]:
@@ -143,13 +150,20 @@ class MatchFilter:
         if not isinstance(pair, MatchPair):
             raise TypeError(f"pairs[{index}]: expected MatchPair or (kp1, kp2, matches), got {type(pair).__name__}")
         prepared = prepare_pair(pair)
-        job = _Job(prepared, timings_ms={"prepare": _milliseconds_since(started)})
+        given = prepared.calibrated
+        if self.options.geometry == "essential" and not given:
+            raise ValueError("K1: geometry='essential' needs the intrinsics")
+        if self.options.geometry == "fundamental":
+            camera1, camera2 = (replace(c, guessed=True) for c in (prepared.intrinsics1, prepared.intrinsics2))
+            prepared = replace(prepared, intrinsics1=camera1, intrinsics2=camera2)
+        job = _Job(prepared, given, timings_ms={"prepare": _milliseconds_since(started)})
         started = time.perf_counter()
         if self.options.method != "none":
             job.evidence = gather_before(prepared)
-            job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
-            if self.options.method == "auto" and self.options.effort == "auto":
-                job.model = job.search.before_network()
+            if self.options.geometry != "homography":
+                job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
+                if self.options.method == "auto" and self.options.effort == "auto":
+                    job.model = job.search.before_network()
             job.timings_ms["fit"] = _milliseconds_since(started)
         if job.model is None:
             job.sent = select_network_input(
@@ -172,6 +186,7 @@ class MatchFilter:
         if job.model is None:
             logits, scores = self._score(job)
             self._fit(job, logits, scores)
+            pair = job.pair  # under another focal length now, where that was estimated
         else:
             logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
@@ -179,8 +194,14 @@ class MatchFilter:
             verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
         else:
             threshold_px, choice = pair.threshold_px(self.options.threshold), self._backend.metadata.choice
-            verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
-            if self.options.keep_precision is not None and (verdict.F is not None or verdict.R is not None):
+            if self.options.geometry == "homography":
+                verdict = judge_homography(pair, job.evidence, threshold_px, self.options)
+            else:
+                verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
+            if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
+                verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
+            found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
+            if self.options.keep_precision is not None and found:
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         job.timings_ms["verdict"] = _milliseconds_since(started)
         return FilterResult(
@@ -191,9 +212,10 @@ class MatchFilter:
             F=verdict.F,
             R=verdict.R,
             t=verdict.t,
+            H=verdict.H,
             status=verdict.status,
             num_inliers=int(np.count_nonzero(verdict.mask)),
-            confidence=None if verdict.R is None or job.model is None else job.model.confidence,
+            confidence=None if verdict.t is None or job.model is None else job.model.confidence,
             points1=pair.points1,
             points2=pair.points2,
             indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
@@ -214,13 +236,32 @@ class MatchFilter:
 
     def _fit(self, job: _Job, logits: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
         """The model on what the network saw."""
-        if job.search is None or job.sent is None:
+        if job.evidence is None or job.sent is None:
             return
         started = time.perf_counter()
         margins = logits - np.float32(self._backend.metadata.decision_threshold)
         job.evidence = gather_scored(job.pair, job.sent.rows, scores, margins, job.network_essential)
-        job.model = job.search.with_network(job.evidence)
+        if job.search is not None:
+            job.model = job.search.with_network(job.evidence)
+        if job.model is not None and not job.given and self.options.geometry == "auto":
+            self._fit_under_estimated_focal(job, scores, margins)
         job.timings_ms["fit"] += _milliseconds_since(started)
+
+    def _fit_under_estimated_focal(self, job: _Job, scores: NDArray[np.float32], margins: NDArray[np.float32]) -> None:
+        """A second fit, of an essential matrix, where the matches tell the focal length that was guessed."""
+        assert job.model is not None
+        assert job.evidence is not None
+        assert job.sent is not None
+        estimate = estimate_focal(job.evidence, job.model.M)
+        if estimate is None:
+            return
+        pair, zoom = job.pair.with_focal(estimate.factor), np.diag([estimate.factor, estimate.factor, 1.0])
+        E = None if job.network_essential is None else project_to_essential(zoom @ job.network_essential @ zoom)
+        evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
+        search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
+        model = search.with_network(evidence)
+        if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
+            job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
 
     def _score_by_residuals(
         self, pair: PairInput, model: TwoViewModel
@@ -238,6 +279,21 @@ class MatchFilter:
         kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.options.keep_precision)
         return kept
 
+    def _describe_cameras(self, job: _Job) -> dict[str, Any]:
+        """Where the intrinsics come from, and what was assumed."""
+        assumptions = list(job.pair.assumptions)
+        if job.focal is None:
+            return {"intrinsics": "given" if job.given else "guessed", "assumptions": assumptions}
+        focal_px = job.pair.focal_px / job.pair.unit_px
+        accuracy = f"to {100 * job.focal.sigma:.0f} %"
+        assumptions.append(f"focal length {focal_px:.0f} px of both images estimated from the matches, {accuracy}")
+        return {
+            "intrinsics": "estimated",
+            "assumptions": assumptions,
+            "focal_px": focal_px,
+            "focal_sigma": job.focal.sigma,
+        }
+
     def _describe(self, job: _Job) -> dict[str, Any]:
         job.timings_ms["total"] = sum(job.timings_ms.values())
         return {
@@ -245,8 +301,7 @@ class MatchFilter:
             "backend": self._backend.name,
             "model": self._backend.metadata.name,
             "model_sha256": self._backend.metadata.sha256,
-            "intrinsics": "given" if job.pair.calibrated else "guessed",
-            "assumptions": list(job.pair.assumptions),
+            **self._describe_cameras(job),
             "num_network_matches": 0 if job.sent is None else len(job.sent.rows),
             "network_rows": np.zeros(0, dtype=np.intp) if job.sent is None else job.sent.rows,
             "network_essential": job.network_essential,
@@ -261,12 +316,14 @@ class _Job:
     """One pair on its way through the steps."""
 
     pair: PairInput
+    given: bool
     timings_ms: dict[str, float]
     evidence: Evidence | None = None
     search: Search | None = None
     model: TwoViewModel | None = None
     sent: NetworkInput | None = None
     output: NetworkOutput | None = None
+    focal: FocalEstimate | None = None
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:
@@ -281,8 +338,8 @@ def filter_matches(
     *,
     K1: MatrixLike | None = None,
     K2: MatrixLike | None = None,
-    dist1: ArrayLike | None = None,
-    dist2: ArrayLike | None = None,
+    dist1: ArrayLike | Fisheye | None = None,
+    dist2: ArrayLike | Fisheye | None = None,
     size1: SizeLike | None = None,
     size2: SizeLike | None = None,
     threshold: float = FilterOptions.threshold,
@@ -290,9 +347,11 @@ def filter_matches(
     confidence: float = FilterOptions.confidence,
     method: str | int = FilterOptions.method,
     effort: str = FilterOptions.effort,
+    geometry: str = FilterOptions.geometry,
     max_iterations: int = FilterOptions.max_iterations,
     attributes: MatchAttributes | None = None,
     K: MatrixLike | None = None,
+    resolution: float = 1.0,
     model: str | Path | None = None,
     providers: Providers | None = None,
     backend: str = "auto",
@@ -310,7 +369,9 @@ def filter_matches(
             best of the list, size, angle) is used and never required.
         K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal length is
             guessed and F is the model to trust.
-        dist1, dist2: OpenCV distortion coefficients; E and F then hold for undistorted points.
+        dist1, dist2: OpenCV distortion coefficients: an array of 4, 5, 8, 12 or 14 is of the pinhole model,
+            ``Fisheye(k1, k2, k3, k4)`` of ``cv2.fisheye``. E and F then hold for undistorted points, the threshold for
+            the pixels that came in.
         size1, size2: (width, height), pixels; they help the guess of missing intrinsics.
         threshold: inlier threshold of the mask, pixels (Sampson distance); the fit has its own.
         keep_precision: instead of a threshold: the mask holds the most matches whose expected precision, the mean of
@@ -323,9 +384,15 @@ def filter_matches(
             ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
         effort: ``"auto"`` leaves the network out where a run on the list alone explains it, and takes the scores from
             the residuals; ``"full"`` always runs it.
+        geometry: ``"auto"``: an essential matrix where intrinsics are given, else a fundamental matrix, and a
+            homography beside or instead of it where that explains the pair; ``"essential"`` demands the intrinsics;
+            ``"fundamental"`` does not let them constrain the model; ``"homography"`` fits one and no more.
         max_iterations: largest number of samples that one run of a robust estimator draws.
         attributes: what the caller knows of each match in arrays (M,); overrides what was read, field by field.
         K: another way to say that both images share ``K1``.
+        resolution: pixels of the original per pixel of the image in which the keypoints were found: the factor by which
+            coordinates that were found in a smaller copy were multiplied, the larger of the two images'. ``threshold``,
+            and the pixels by which the fit judges, are then those of the copy.
         model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
         backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
@@ -348,13 +415,14 @@ def filter_matches(
         confidence=confidence,
         method=method,
         effort=effort,
+        geometry=geometry,
         max_iterations=max_iterations,
         model=model,
         providers=providers,
         backend=backend,
         seed=seed,
     )
-    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes)
+    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes, resolution)
     return match_filter.filter_many([pair])[0]
 
 

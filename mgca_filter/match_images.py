@@ -9,7 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .features import SIFT_FEATURE_COUNT, create_detector, detect_keypoints, match_descriptors
+from .features import (
+    SIFT_FEATURE_COUNT,
+    create_detector,
+    detect_keypoints,
+    detector_resolution,
+    match_descriptors,
+)
 from .match_filter import filter_matches
 from .result import FilterResult
 
@@ -47,14 +53,14 @@ def match_images(
     """Detect, match and filter two images, with the settings that the training data used.
 
     Keypoints come from a grey copy of at most 1200 px on its longer side and are given back in pixels of the
-    original.
+    original; ``threshold`` is in pixels of the copy, of the larger image where the two differ.
 
     Args:
         image1, image2: uint8 (H, W) grey, (H, W, 3) BGR or (H, W, 4) BGRA.
         detector: ``"sift"``, ``"orb"``, ``"akaze"``, or any ``cv2.Feature2D`` that describes.
         max_keypoints: per image, for a detector given by name.
-        options: keyword options of :func:`mgca_filter.filter_matches`; ``size1`` and ``size2`` are the images'
-            own unless given.
+        options: keyword options of :func:`mgca_filter.filter_matches`; ``size1``, ``size2`` and
+            ``resolution`` are the images' own unless given.
 
     Raises:
         TypeError, ValueError: an argument or option is of another type, shape or range.
@@ -70,5 +76,6 @@ def match_images(
     for name, image in (("size1", image1), ("size2", image2)):
         if options.get(name) is None:
             options[name] = np.array([image.shape[1], image.shape[0]])
+    options.setdefault("resolution", max(detector_resolution(image.shape[1::-1]) for image in (image1, image2)))
     result = filter_matches(keypoints1, keypoints2, matches, **options)
     return ImageMatchResult(keypoints1, keypoints2, matches, result)

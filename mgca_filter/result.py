@@ -51,6 +51,8 @@ class FilterResult:
         E: (3, 3) float64 essential matrix (two equal singular values, unit Frobenius norm), or None.
         F: (3, 3) float64 fundamental matrix of unit Frobenius norm, or None.
         R, t: (3, 3) rotation and (3,) unit translation, or None.
+        H: (3, 3) homography, ``p2 ~ H p1`` in pixels, with H[2, 2] = 1, where one explains the pair (a plane, a camera
+            that only turned) or was asked for; else None.
         status: the verdict.
         num_inliers: number of True in ``mask``.
         confidence: calibrated probability that the pose is within 10 degrees of the truth, in rotation and in
@@ -58,15 +60,16 @@ class FilterResult:
         points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
-            ``intrinsics`` ("given" or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
+            ``intrinsics`` ("given", "estimated" with ``focal_px`` and ``focal_sigma``, its relative
+            standard deviation, or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
             ``network_rows`` (those that entered the network), ``num_accepted`` (those above the decision threshold),
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
             robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",
             "network", "accepted", "score order", …, "plane"), and where the search ``ended`` ("before the network",
             where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:
-            ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``homography`` (3, 3) that
-            explains the pair, ``focal_factor`` where the matches ask for focal lengths that many times those given
-            (rough, a power of 1.2).
+            ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``translation_sigma_deg``
+            (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``focal_factor``
+            where the matches ask for focal lengths that many times those given (rough, a power of 1.2).
     """
 
     mask: NDArray[np.bool_]
@@ -76,6 +79,7 @@ class FilterResult:
     F: NDArray[np.float64] | None
     R: NDArray[np.float64] | None
     t: NDArray[np.float64] | None
+    H: NDArray[np.float64] | None
     status: Status
     num_inliers: int
     confidence: float | None = None

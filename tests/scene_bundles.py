@@ -39,3 +39,22 @@ def write_bundle(path: Path, scenes: Sequence[Scene], **changes: np.ndarray | No
     fields = {**bundle_fields(scenes), **changes}
     np.savez_compressed(path, **{name: value for name, value in fields.items() if value is not None})
     return path
+
+
+def learned_fields(scenes: Sequence[Scene], seed: int = 0) -> dict[str, np.ndarray | None]:
+    """Changes that turn a bundle into that of a learned matcher: every other keypoint is left out, the rest scored.
+
+    Right matches score high; keypoints have neither size nor angle.
+    """
+    kept = [np.arange(len(scene.points1))[::2] for scene in scenes]
+    right = np.concatenate([scene.inlier[rows] for scene, rows in zip(scenes, kept)])
+    noise = np.random.default_rng(seed).uniform(0.0, 0.3, len(right))
+    index = np.concatenate(kept).astype(np.uint16)
+    return {
+        **dict.fromkeys(("match_ratio", "match_mutual", "match_best")),
+        "match_offset": np.concatenate([[0], np.cumsum([len(rows) for rows in kept])]),
+        "match_query": index,
+        "match_index": index,
+        "match_score": np.round(255 * (0.7 * right + noise)).astype(np.uint8),
+        "has_size_angle": np.bool_(False),
+    }

@@ -1,4 +1,4 @@
-"""From the bytes of a file to pixels: depth, orientation, size; and whether intrinsics can be those of an image."""
+"""From the bytes of a file to pixels: depth, orientation, size; and what speaks against a principal point."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from image_files import promising
 
-from mgca_filter.images import decode_image, intrinsics_doubts
+from mgca_filter.images import decode_image, principal_point_doubt
 
 AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -89,20 +89,14 @@ def camera(f: float, x: float, y: float) -> np.ndarray:
     return np.array([[f, 0, x], [0, f, y], [0, 0, 1.0]])
 
 
-def test_intrinsics_that_fit_raise_no_doubt() -> None:
-    assert intrinsics_doubts(camera(820, 511.5, 383.5), [(1024, 768), (1024, 768)]) == []
-    assert intrinsics_doubts(camera(820, 400, 300), [(1024, 768)]) == []  # a crop
-    assert intrinsics_doubts(camera(820, 511.5, 383.5), []) == []
-
-
 @pytest.mark.parametrize(
-    ("sizes", "words"),
-    [
-        ([(1024, 768), (768, 1024)], "768 x 1024, 1024 x 768"),
-        ([(1024, 768), (819, 614)], "one K for images of 2 sizes"),
-        ([(410, 307)], "the principal point 511.5,383.5"),
-        ([(2560, 1920)], "far from the middle of an image of 2560 x 1920"),
-    ],
+    ("K", "size"), [(camera(820, 511.5, 383.5), (1024, 768)), (camera(820, 400, 300), (1024, 768))]
 )
-def test_intrinsics_of_another_size_raise_a_doubt(sizes: list[tuple[int, int]], words: str) -> None:
-    assert any(words in doubt for doubt in intrinsics_doubts(camera(820, 511.5, 383.5), sizes))
+def test_a_principal_point_near_the_middle_raises_no_doubt(K: np.ndarray, size: tuple[int, int]) -> None:
+    assert principal_point_doubt(K, size) is None
+
+
+@pytest.mark.parametrize("size", [(410, 307), (2560, 1920)])
+def test_a_principal_point_far_from_the_middle_raises_a_doubt(size: tuple[int, int]) -> None:
+    words = f"the principal point 511.5,383.5 is far from the middle of an image of {size[0]} x {size[1]}"
+    assert principal_point_doubt(camera(820, 511.5, 383.5), size) == words

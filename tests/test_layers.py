@@ -29,7 +29,7 @@ FLOORS = (
     ("inputs",),
     ("html_report",),
     ("result",),
-    ("network", "drawing", "images", "tables", "verdict_text"),
+    ("network", "drawing", "exif", "images", "tables", "verdict_text"),
     ("geometry",),
     ("types", "atomic_file"),
     ("errors",),

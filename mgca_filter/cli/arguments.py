@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..inputs.options import METHODS
+from ..inputs.options import EFFORTS, GEOMETRIES, METHODS, FilterOptions
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
 
@@ -38,7 +38,13 @@ class OneLineParser(argparse.ArgumentParser):
 def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = False) -> None:
     """The options that :func:`filter_options` reads; with ``fit_required`` scores alone are no method."""
     group = parser.add_argument_group("filter")
-    group.add_argument("--threshold", metavar="PX", type=positive(float), default=1.0, help="pixels, default 1.0")
+    group.add_argument(
+        "--threshold",
+        metavar="PX",
+        type=positive(float),
+        default=FilterOptions.threshold,
+        help="pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default 1.0",
+    )
     group.add_argument(
         "--keep-precision",
         metavar="P",
@@ -47,7 +53,16 @@ def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = 
     )
     methods = [method for method in METHODS if method != "none" or not fit_required]
     scores_alone = "" if fit_required else "; none = scores alone"
-    group.add_argument("--method", choices=methods, default="prosac", help=f"robust fit, default prosac{scores_alone}")
+    default = FilterOptions.method
+    group.add_argument(
+        "--method", choices=methods, default=default, help=f"robust fit, default {default}{scores_alone}"
+    )
+    group.add_argument(
+        "--effort", choices=EFFORTS, default=FilterOptions.effort, help="full = the network even where it is not needed"
+    )
+    group.add_argument(
+        "--geometry", choices=GEOMETRIES, default=FilterOptions.geometry, help="model that is fitted, default auto"
+    )
     group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
     group.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
     group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
@@ -59,6 +74,8 @@ def filter_options(options: argparse.Namespace) -> dict[str, Any]:
         "threshold": options.threshold,
         "keep_precision": options.keep_precision,
         "method": options.method,
+        "effort": options.effort,
+        "geometry": options.geometry,
         "model": None if options.model is None else str(options.model),
         "providers": options.providers.split(",") if options.providers else None,
         "seed": options.seed,

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..errors import MgcaFilterError
-from ..features import DETECTORS
-from ..images import decode_image, intrinsics_doubts
+from ..exif import exif_intrinsics
+from ..features import DETECTORS, detector_resolution
+from ..images import decode_image, principal_point_doubt
 from ..match_images import match_images
+from ..result import Status
 from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
@@ -72,10 +74,13 @@ def build_parser() -> argparse.ArgumentParser:
     out.add_argument("--compare", action="store_true", help="run RANSAC and MAGSAC on the same matches as well")
     out.add_argument("-q", "--quiet", action="store_true", help="no summary, errors only")
     out.add_argument("-v", "--verbose", action="store_true", help="log what is done, on stderr")
-    camera = parser.add_argument_group("cameras", "fx,fy,cx,cy in pixels; without them the focal length is guessed")
-    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of both images")
+    camera = parser.add_argument_group(
+        "cameras", "fx,fy,cx,cy in pixels; without them the focal length is that of the EXIF data, or guessed"
+    )
+    camera.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of both images, of one size")
     camera.add_argument("--K1", metavar="fx,fy,cx,cy", type=intrinsics, help="of the first image, with --K2")
     camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=intrinsics, help="of the second image, with --K1")
+    camera.add_argument("--no-exif", action="store_true", help="do not read the focal length from EXIF data")
     matching = parser.add_argument_group("matching")
     matching.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
     matching.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
@@ -84,14 +89,16 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def read_image(path: Path) -> NDArray[np.uint8]:
-    """Colour image (h, w, 3) BGR uint8, upright as its EXIF says.
+def read_photo(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.float64] | None]:
+    """Colour image (h, w, 3) BGR uint8, upright as its EXIF says, and K (3, 3) where its EXIF knows the focal length.
 
     Raises:
         UsageError: the file cannot be read or decoded; the message names it.
     """
     try:
-        return decode_image(path.read_bytes())
+        data = path.read_bytes()
+        image = decode_image(data)
+        return image, exif_intrinsics(data, (image.shape[1], image.shape[0]))
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror or error}") from error
     except ValueError as error:
@@ -111,37 +118,39 @@ def _check_outputs(options: argparse.Namespace) -> None:
 
 
 def _camera_matrices(options: argparse.Namespace) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """K1 and K2; the second is None where both images share the first, so that other sizes are refused."""
     if (options.K1 is None) != (options.K2 is None):
         raise UsageError("--K1 and --K2 go together; --K is for both images")
     if options.K is not None and options.K1 is not None:
         raise UsageError("--K excludes --K1 and --K2")
-    return (options.K, options.K) if options.K is not None else (options.K1, options.K2)
+    return (options.K, None) if options.K is not None else (options.K1, options.K2)
 
 
 def _match(options: argparse.Namespace) -> MatchReport:
     """Read, match, filter and, with ``--compare``, fit the baselines."""
     K1, K2 = _camera_matrices(options)
     _check_outputs(options)
-    image1, image2 = read_image(options.image1), read_image(options.image2)
+    (image1, exif1), (image2, exif2) = read_photo(options.image1), read_photo(options.image2)
+    by_exif = K1 is None and exif1 is not None and exif2 is not None and not options.no_exif
+    if by_exif:
+        K1, K2 = exif1, exif2
     _log.info("%s: %d x %d, %s: %d x %d", options.image1, *image1.shape[1::-1], options.image2, *image2.shape[1::-1])
-    sizes = [(image.shape[1], image.shape[0]) for image in (image1, image2)]
-    for K, of in ((options.K, sizes), (options.K1, sizes[:1]), (options.K2, sizes[1:])):
-        for doubt in [] if K is None else intrinsics_doubts(K, of):
-            _log.warning("warning: %s", doubt)
     start = time.perf_counter()
-    matched = match_images(
-        image1,
-        image2,
-        detector=options.detector,
-        max_keypoints=options.max_keypoints,
-        K1=K1,
-        K2=K2,
-        **filter_options(options),
-    )
+    settings = {"detector": options.detector, "max_keypoints": options.max_keypoints, **filter_options(options)}
+    matched = match_images(image1, image2, K1=K1, K2=K2, **settings)
+    if by_exif and matched.result.status is Status.SUSPICIOUS_INTRINSICS:
+        _log.warning("warning: the matches contradict the focal length of the EXIF data, matched without it")
+        by_exif, K1, K2 = False, None, None
+        matched = match_images(image1, image2, **settings)
     total_ms = 1e3 * (time.perf_counter() - start)
     for assumption in matched.result.info.get("assumptions", ()):
         _log.info("assumed: %s", assumption)
-    report = MatchReport(options.image1, options.image2, image1, image2, K1, K2, matched, total_ms)
+    K2 = K1 if K2 is None else K2
+    for K, image in ((K1, image1), (K2, image2)):
+        doubt = None if K is None else principal_point_doubt(K, (image.shape[1], image.shape[0]))
+        if doubt is not None:
+            _log.warning("warning: %s", doubt)
+    report = MatchReport(options.image1, options.image2, image1, image2, K1, K2, matched, total_ms, by_exif=by_exif)
     if not options.compare:
         return report
     baselines: list[BaselineFit] = fit_baselines(
@@ -151,7 +160,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
         K2,
         size1=report.sizes[0],
         size2=report.sizes[1],
-        threshold_px=options.threshold,
+        threshold_px=options.threshold * max(map(detector_resolution, report.sizes)),
         seed=options.seed,
     )
     return report.with_baselines(baselines)

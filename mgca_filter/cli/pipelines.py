@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -11,7 +12,7 @@ from typing import Any
 
 from ..errors import MgcaFilterError
 from ..features import DETECTORS
-from ..pipelines.run import Summary, Workers
+from ..pipelines.run import Report, Summary, Workers
 from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
@@ -91,6 +92,7 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
     )
     command.add_argument("--overlap", metavar="N", type=positive(int), default=10, help="sequential: N next images")
     command.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of all images, pixels")
+    command.add_argument("--no-exif", action="store_true", help="without --K: guess the focal length, do not read EXIF")
     command.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
     command.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
     command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
@@ -104,6 +106,7 @@ def _add_common(command: argparse.ArgumentParser) -> None:
     workers.add_argument("-j", "--jobs", metavar="N", type=positive(int), default=1, help="workers, default 1")
     workers.add_argument("--engine", choices=("local", "ray"), default="local", help="processes here (default), or Ray")
     workers.add_argument("--address", metavar="HOST", help='of a Ray cluster ("auto" = this machine\'s)')
+    command.add_argument("--html", metavar="REPORT.html", type=Path, help="report of all pairs for a browser, one file")
     command.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary, errors only")
     command.add_argument("--overwrite", action="store_true", help="replace an output that exists")
 
@@ -118,6 +121,18 @@ def _check_output(options: argparse.Namespace, output: Path, inputs: Sequence[Pa
         raise UsageError(f"{output}: exists; --overwrite replaces it")
 
 
+def _report(options: argparse.Namespace, source: Path, inputs: Sequence[Path]) -> Report | None:
+    """What ``--html`` asks for; a report is replaced like one of ``mgca-match img1 img2``."""
+    if options.html is None:
+        return None
+    path: Path = options.html
+    if not path.parent.is_dir() or path.is_dir():
+        raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
+    if path.resolve() in {other.resolve() for other in inputs}:
+        raise UsageError(f"{path}: is the input or the output")
+    return Report(path, source.resolve().name, options.command_line)
+
+
 def _run_colmap(options: argparse.Namespace) -> Summary:
     from ..pipelines.colmap import ColmapJob
 
@@ -128,7 +143,8 @@ def _run_colmap(options: argparse.Namespace) -> Summary:
         _check_output(options, output, [options.database])
     if options.truth is not None and not options.compare:
         raise UsageError("--truth goes with --compare")
-    job = ColmapJob(options.database, output, use_descriptors=not options.no_descriptors)
+    report = _report(options, options.database, [options.database, output])
+    job = ColmapJob(options.database, output, use_descriptors=not options.no_descriptors, report=report)
     summary = _with_workers(job, options)
     if options.compare:
         from ..pipelines.mapper_comparison import compare, comparison_table
@@ -141,7 +157,14 @@ def _run_hloc(options: argparse.Namespace) -> Summary:
     from ..pipelines.hloc import HlocJob
 
     _check_output(options, options.output, [options.features, options.matches])
-    job = HlocJob(options.features, options.matches, options.output, use_descriptors=not options.no_descriptors)
+    report = _report(options, options.matches, [options.features, options.matches, options.output])
+    job = HlocJob(
+        options.features,
+        options.matches,
+        options.output,
+        use_descriptors=not options.no_descriptors,
+        report=report,
+    )
     return _with_workers(job, options)
 
 
@@ -169,6 +192,8 @@ def _run_folder(options: argparse.Namespace) -> Summary:
         options.detector,
         options.max_keypoints,
         options.cache,
+        _report(options, options.images, [options.output]),
+        exif=not options.no_exif,
     )
     return _with_workers(job, options)
 
@@ -190,6 +215,7 @@ def main(arguments: Sequence[str]) -> int:
     """Run a subcommand; returns the exit status (0 = geometry found, 1 = for no pair, 2 = usage or files)."""
     try:
         options = build_parser().parse_args(arguments)
+        options.command_line = shlex.join(["mgca-match", *arguments])
         quiet_codecs()
         for package in _PACKAGES + (["ray"] if options.engine == "ray" else []):
             import_module(package)  # better missed now than when all pairs are done

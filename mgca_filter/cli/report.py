@@ -30,10 +30,11 @@ class MatchReport:
 
     Attributes:
         path1, path2: the image files; image1, image2: their pixels (h, w, 3) uint8.
-        K1, K2: (3, 3) as given, or None.
+        K1, K2: (3, 3) as given or as the EXIF data have it, or None.
         matched: keypoints, raw matches and the filter's result.
         total_ms: from the images in memory to the result, milliseconds.
         baselines: fits of the estimators alone, or None.
+        by_exif: K1 and K2 come from EXIF data.
     """
 
     path1: Path
@@ -45,6 +46,7 @@ class MatchReport:
     matched: ImageMatchResult
     total_ms: float
     baselines: Sequence[BaselineFit] | None = None
+    by_exif: bool = False
 
     def with_baselines(self, baselines: Sequence[BaselineFit]) -> MatchReport:
         """The same report with the fits of the estimators alone."""
@@ -78,6 +80,11 @@ class MatchReport:
         return (w1, h1), (w2, h2)
 
     @property
+    def intrinsics(self) -> str:
+        """``"given"``, ``"exif"``, ``"estimated"`` or ``"guessed"``."""
+        return "exif" if self.by_exif else str(self.result.info.get("intrinsics"))
+
+    @property
     def filter_ms(self) -> float:
         """Time of the filter alone, from matches to result, milliseconds."""
         return float(self.result.info["timings_ms"]["total"])
@@ -102,9 +109,11 @@ def summary(report: MatchReport) -> str:
     sides = zip((report.path1, report.path2), report.sizes, (matched.keypoints1, matched.keypoints2))
     for path, (width, height), keypoints in sides:
         lines.append(f"{path}: {width} x {height}, {len(keypoints)} keypoints")
+    if report.by_exif and report.K1 is not None and report.K2 is not None:
+        lines.append(f"focal lengths {report.K1[0, 0]:.0f} and {report.K2[0, 0]:.0f} px, from EXIF data")
     lines.append(f"{count} matches in, {result.num_inliers} kept{share}, status {result.status.value}")
     if result.R is not None:
-        guessed = result.info.get("intrinsics") == "guessed"
+        guessed = report.intrinsics == "guessed"
         remark = ", focal length guessed: trust F rather than the pose" if guessed else ""
         lines.append(f"rotation {describe_rotation(result.R)}, translation {describe_translation(result.t)}{remark}")
     lines.append(f"{report.total_ms:.0f} ms, of which the filter took {report.filter_ms:.0f}")
@@ -138,7 +147,7 @@ def to_json(report: MatchReport) -> str:
         "K1": report.K1,
         "K2": report.K2,
         "homography": info.get("homography"),
-        "intrinsics": info.get("intrinsics"),
+        "intrinsics": report.intrinsics,
         "assumptions": list(info.get("assumptions", ())),
         "backend": info.get("backend"),
         "model": info.get("model"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -20,10 +20,16 @@ from ..inputs.attributes import MatchAttributes
 _FIELDS = (
     *("image_name", "image_size", "K", "R", "t"),
     *("keypoint_offset", "keypoint_xy", "keypoint_size", "keypoint_angle"),
-    *("pair", "match_offset", "match_index", "match_ratio", "match_mutual", "match_best", "covisible"),
+    *("pair", "match_offset", "match_index", "covisible"),
 )
+_NEIGHBOUR_FIELDS = ("match_ratio", "match_mutual", "match_best")
+_LEARNED_FIELDS = ("match_query", "match_score")
+"""What a learned matcher tells, in the place of nearest neighbours' fields: it leaves keypoints out and scores its own
+matches (LightGlue, Lindenberger et al., ICCV 2023)."""
 LABEL_FIELD = "match_label"
 """Optional field: labels (ΣM,) int8 of all matches, for bundles that know them better than poses tell."""
+SHAPE_FIELD = "has_size_angle"
+"""Optional field: False where the detector gives keypoints neither size nor angle."""
 ANGLE_UNITS = 256  # of a full turn, to fit a byte
 
 
@@ -33,7 +39,8 @@ class ScenePair:
 
     ``points1``, ``points2`` are undistorted pixels (M, 2) under ``K1``, ``K2``; ``mutual`` (M,) marks two-way
     nearest neighbours; ``t`` (3,) has the scene's unknown scale; ``labels`` (M,) int8 (1 = right, 0 = wrong, −1 = left
-    out) where the data know them better than the pose tells, else None.
+    out) where the data know them better than the pose tells, else None; ``match_scores`` (M,) float32, 0 … 1, where the
+    matcher scored its matches, else None.
     """
 
     scene: str
@@ -51,11 +58,31 @@ class ScenePair:
     attributes: MatchAttributes
     mutual: NDArray[np.bool_]
     labels: NDArray[np.int8] | None = None
+    match_scores: NDArray[np.float32] | None = None
 
     @property
     def name(self) -> str:
         """``scene/index``, unique in a folder of bundles."""
         return f"{self.scene}/{self.index}"
+
+    @property
+    def order(self) -> NDArray[np.float32] | None:
+        """What tells promising matches (M,) from others, ascending: the ratio, else 1 − score, else None."""
+        if self.attributes.ratio is not None or self.match_scores is None:
+            return self.attributes.ratio
+        return np.float32(1.0) - self.match_scores
+
+    def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> ScenePair:
+        """The pair with a selection of its matches, in the order of ``rows``."""
+        return replace(
+            self,
+            points1=self.points1[rows],
+            points2=self.points2[rows],
+            attributes=self.attributes.take(rows),
+            mutual=self.mutual[rows],
+            labels=None if self.labels is None else self.labels[rows],
+            match_scores=None if self.match_scores is None else self.match_scores[rows],
+        )
 
     @cached_property
     def correspondences(self) -> NDArray[np.float64]:
@@ -80,19 +107,26 @@ class SceneBundle:
         self.scene = self.path.stem
         try:
             with np.load(self.path, allow_pickle=False) as data:
-                missing = [field for field in _FIELDS if field not in data.files]
+                self.learned = any(field in data.files for field in _LEARNED_FIELDS)
+                needed = (*_FIELDS, *(_LEARNED_FIELDS if self.learned else _NEIGHBOUR_FIELDS))
+                missing = [field for field in needed if field not in data.files]
                 if missing:
                     raise BundleError(f"{self.path}: not a scene bundle, fields missing: {', '.join(missing)}")
-                self._data = {field: data[field] for field in (*_FIELDS, LABEL_FIELD) if field in data.files}
+                optional = [field for field in (LABEL_FIELD, SHAPE_FIELD) if field in data.files]
+                self._data = {field: data[field] for field in (*needed, *optional)}
         except BundleError:
             raise
         except Exception as error:  # zipfile, zlib, numpy and the system each have their own
             raise BundleError(f"{self.path}: cannot be read as a scene bundle ({error})") from error
         self._check_shapes()
         count = int(self._data["match_offset"][-1])
-        for field in ("match_mutual", "match_best"):
+        for field in self._packed_fields:
             self._data[field] = np.unpackbits(self._data[field], count=count).astype(bool)
         self._check_values()
+
+    @property
+    def _packed_fields(self) -> tuple[str, ...]:
+        return () if self.learned else ("match_mutual", "match_best")
 
     def _check_shapes(self) -> None:
         d = self._data
@@ -123,12 +157,15 @@ class SceneBundle:
             "match_ratio": (matches,),
             "match_mutual": ((matches + 7) // 8,),
             "match_best": ((matches + 7) // 8,),
+            "match_query": (matches,),
+            "match_score": (matches,),
             LABEL_FIELD: (matches,),
+            SHAPE_FIELD: (),
         }
         for field, shape in lengths.items():
             if field in d and d[field].shape != shape:
                 raise BundleError(f"{self.path}: {field} has the shape {d[field].shape}, its offsets promise {shape}")
-        for field in ("match_mutual", "match_best"):
+        for field in self._packed_fields:
             if d[field].dtype != np.uint8:
                 raise BundleError(f"{self.path}: {field} is not packed into bytes (np.packbits)")
 
@@ -174,13 +211,13 @@ class SceneBundle:
             raise IndexError(f"{self.path}: pair {index} of {len(self)}")
         i, j = (int(v) for v in d["pair"][index])
         rows = slice(int(d["match_offset"][index]), int(d["match_offset"][index + 1]))
-        count = rows.stop - rows.start
-        start_i, start_j = int(d["keypoint_offset"][i]), int(d["keypoint_offset"][j])
-        k1 = start_i + np.arange(count)
-        k2 = start_j + d["match_index"][rows].astype(np.int64)
-        if count and (k1[-1] >= d["keypoint_offset"][i + 1] or k2.max() >= d["keypoint_offset"][j + 1]):
-            raise BundleError(f"{self.path}: match_index of pair {index} names a keypoint that is not there")
-        size, angle, degrees = d["keypoint_size"], d["keypoint_angle"], np.float32(360.0 / ANGLE_UNITS)
+        query = d["match_query"][rows].astype(np.int64) if self.learned else np.arange(rows.stop - rows.start)
+        k1 = int(d["keypoint_offset"][i]) + query
+        k2 = int(d["keypoint_offset"][j]) + d["match_index"][rows].astype(np.int64)
+        for field, reached, image in (("match_query", k1, i), ("match_index", k2, j)):
+            if len(reached) and reached.max() >= d["keypoint_offset"][image + 1]:
+                named = field if self.learned else "match_index"
+                raise BundleError(f"{self.path}: {named} of pair {index} names a keypoint that is not there")
         R = d["R"][j] @ d["R"][i].T
         return ScenePair(
             scene=self.scene,
@@ -195,16 +232,28 @@ class SceneBundle:
             image_size2=(int(d["image_size"][j][0]), int(d["image_size"][j][1])),
             R=R,
             t=d["t"][j] - R @ d["t"][i],
-            attributes=MatchAttributes(
-                ratio=d["match_ratio"][rows].astype(np.float32) / np.float32(255.0),
-                best=d["match_best"][rows],
-                size1=size[k1].astype(np.float32),
-                size2=size[k2].astype(np.float32),
-                angle1=angle[k1] * degrees,
-                angle2=angle[k2] * degrees,
-            ),
-            mutual=d["match_mutual"][rows],
+            attributes=self._attributes(rows, k1, k2),
+            # A learned matcher gives each keypoint one partner at most.
+            mutual=np.ones(len(k1), dtype=bool) if self.learned else d["match_mutual"][rows],
             labels=np.asarray(d[LABEL_FIELD][rows], dtype=np.int8) if LABEL_FIELD in d else None,
+            match_scores=d["match_score"][rows].astype(np.float32) / np.float32(255.0) if self.learned else None,
+        )
+
+    def _attributes(self, rows: slice, k1: NDArray[np.int64], k2: NDArray[np.int64]) -> MatchAttributes:
+        """What is known of the matches ``rows`` from keypoints ``k1`` (M,) to ``k2`` (M,)."""
+        d, known = self._data, MatchAttributes()
+        if not self.learned:
+            ratio = d["match_ratio"][rows].astype(np.float32) / np.float32(255.0)
+            known = replace(known, ratio=ratio, best=d["match_best"][rows])
+        if not d.get(SHAPE_FIELD, True):
+            return known
+        size, angle, degrees = d["keypoint_size"], d["keypoint_angle"], np.float32(360.0 / ANGLE_UNITS)
+        return replace(
+            known,
+            size1=size[k1].astype(np.float32),
+            size2=size[k2].astype(np.float32),
+            angle1=angle[k1] * degrees,
+            angle2=angle[k2] * degrees,
         )
 
 

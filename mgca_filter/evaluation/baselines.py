@@ -25,6 +25,12 @@ REVISION = 1
 NEVER_CONFIDENT = 1.0 - 1e-9
 """Confidence of time-matched rows, at which an estimator uses up its iterations instead of stopping early."""
 
+UP_TO = "up to"
+"""Words of a row's name, in front of a number of iterations: no more than these."""
+
+LIST_ORDER = "list order"
+"""Part of a row's name: the estimator behind it gets the matches as they are listed, whatever is known of them."""
+
 INFINITE_DEPTH = 1e9
 """``recoverPose`` drops points farther than 50 baselines unless told otherwise."""
 
@@ -129,18 +135,22 @@ class OpenCvEstimator:
 class PoseLibEstimator:
     """``poselib.estimate_relative_pose`` at its defaults but for threshold, seed and ``progressive_sampling``.
 
-    ``iterations`` makes it a time-matched row: that many, whatever was found before.
+    ``iterations`` makes it a time-matched row: that many, whatever was found before. ``max_iterations`` takes the place
+    of PoseLib's own limit of 100 000.
     """
 
     threshold_px: float
     progressive: bool = False
     iterations: int | None = None
+    max_iterations: int | None = None
 
     seeded: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
         budget = "" if self.iterations is None else f" {self.iterations} iterations"
+        if self.max_iterations is not None:
+            budget = f" {UP_TO} {self.max_iterations} iterations"
         return f"PoseLib {'progressive ' if self.progressive else ''}{self.threshold_px:g} px{budget}"
 
     @property
@@ -161,6 +171,8 @@ class PoseLibEstimator:
             "progressive_sampling": self.progressive,
             "seed": seed,
         }
+        if self.max_iterations is not None:
+            options["max_iterations"] = self.max_iterations
         if self.iterations is not None:
             options |= {"min_iterations": self.iterations, "max_iterations": self.iterations}
         camera1, camera2 = _pinhole(pair.K1, pair.image_size1), _pinhole(pair.K2, pair.image_size2)
@@ -223,14 +235,20 @@ class DegensacEstimator:
 
 @dataclass(frozen=True)
 class Baseline:
-    """A selection of matches followed by a robust estimator."""
+    """A selection of matches followed by a robust estimator.
+
+    An estimator that wants the best matches first gets them in :attr:`ScenePair.order`: by ratio, or by the matcher's
+    score; with ``in_list_order`` as they are listed, for lists of which neither is known.
+    """
 
     selection: Selection
     estimator: Estimator
+    in_list_order: bool = False
 
     @property
     def name(self) -> str:
-        return " + ".join([*(self.selection.parts or ["NN"]), self.estimator.name])
+        order = [LIST_ORDER] * self.in_list_order
+        return " + ".join([*(self.selection.parts or ["NN"]), *order, self.estimator.name])
 
     @property
     def seeded(self) -> bool:
@@ -242,6 +260,8 @@ class Baseline:
             "selection": self.selection.settings(),
             "estimator": self.estimator.settings(),
         }
+        if self.in_list_order:
+            settings["order"] = LIST_ORDER
         if self.selection.gms:
             settings |= {"opencv": cv2.__version__, "gms_points": "inside the image"}
         return settings
@@ -252,11 +272,11 @@ class Baseline:
         mask = np.zeros(len(kept), dtype=bool)
         if len(rows) < MIN_MATCHES:
             return Answer(None, None, kept, mask, "fewer than 5 matches")
-        if self.estimator.ordered:
-            ratio = pair.attributes.ratio
-            if ratio is None:
-                raise ValueError(f"{self.estimator.name} needs the distance ratios of the matches")
-            rows = rows[np.argsort(ratio[rows], kind="stable")]
+        if self.estimator.ordered and not self.in_list_order:
+            order = pair.order
+            if order is None:
+                raise ValueError(f"{self.estimator.name} needs the distance ratios of the matches, or their scores")
+            rows = rows[np.argsort(order[rows], kind="stable")]
         estimate = self.estimator.estimate(pair, rows, seed)
         mask[rows] = estimate.inliers
         return Answer(estimate.R, estimate.t, kept, mask, estimate.failure)

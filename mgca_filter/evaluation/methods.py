@@ -44,6 +44,8 @@ class Answer:
         mask: bool (M,), the decision after it: what a user gets.
         failure: empty, or why there is no pose.
         logits, scores: (M,) the network's logits and the probabilities made from them, for methods that have any.
+        status, confidence: the filter's verdict, and its probability that the pose is within 10 degrees; empty and None
+            where a method has none.
     """
 
     R: FloatArray | None
@@ -53,6 +55,8 @@ class Answer:
     failure: str = ""
     logits: FloatArray | None = None
     scores: FloatArray | None = None
+    status: str = ""
+    confidence: float | None = None
 
 
 class Method(Protocol):
@@ -91,6 +95,7 @@ class PairOutcome:
         paper: (precision, recall, F) at logit > 2, for methods that have logits.
         counts: right and wrong matches over the scores, likewise.
         properties: how hard the pair is; None where it could not be read.
+        status, confidence: as in :class:`Answer`.
     """
 
     pair: int
@@ -103,6 +108,8 @@ class PairOutcome:
     paper: tuple[float, float, float] | None = None
     counts: ScoreCounts | None = None
     properties: PairProperties | None = None
+    status: str = ""
+    confidence: float | None = None
 
     @property
     def unreadable(self) -> bool:
@@ -111,7 +118,7 @@ class PairOutcome:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> PairOutcome:
-        """Outcome from what ``dataclasses.asdict`` gave; older ones may hold other fields, and lack the last three."""
+        """Outcome from what ``dataclasses.asdict`` gave; older ones may hold other fields, and lack the last ones."""
         values = {field.name: content[field.name] for field in fields(cls) if field.name in content}
         for name in ("kept", "mask", "paper"):
             if values.get(name) is not None:

@@ -272,3 +272,27 @@ def reliability(pairs: Sequence[ScoreCounts]) -> list[ReliabilityBin]:
         ReliabilityBin(float(total[i] / count[i]), float(right[i] / count[i]), int(count[i]))
         for i in np.flatnonzero(count)
     ]
+
+
+def calibration_gap(bins: Sequence[ReliabilityBin]) -> float:
+    """Expected calibration error: mean distance of probability and share of true ones, bins weighted by size; 0 empty.
+
+    Naeini et al., AAAI 2015.
+    """
+    total = sum(one.matches for one in bins)
+    gap = sum(one.matches * abs(one.probability - one.share_right) for one in bins)
+    return gap / total if total else 0.0
+
+
+def area_under_roc(values: ArrayLike, truth: ArrayLike) -> float:
+    """Probability that a true one has the higher of two values, 0 … 1, ties counting half; NaN without both kinds.
+
+    Args:
+        values: (N,). truth: bool (N,).
+    """
+    values, truth = np.asarray(values, dtype=np.float64), np.asarray(truth, dtype=bool)
+    right, wrong = np.sort(values[truth]), np.sort(values[~truth])
+    if not len(right) or not len(wrong):
+        return float("nan")
+    below, up_to = (np.searchsorted(wrong, right, side=side) for side in ("left", "right"))
+    return float(np.mean(below + up_to) / (2.0 * len(wrong)))

@@ -77,8 +77,10 @@ class ProductMethod:
         rows = np.flatnonzero(kept)
         result = filter_pair(pair, rows, self.model, self._options(seed), bare=self.variant == "product bare")
         logits = np.asarray(result.info["logits"], dtype=np.float64)
+        verdict: dict[str, Any] = {}
         if self.variant.startswith("product"):
             estimate = _pose_of_result(result)
+            verdict = {"status": result.status.value, "confidence": result.confidence}
         else:
             x1 = normalize_points(pair.points1[rows], pair.K1)
             x2 = normalize_points(pair.points2[rows], pair.K2)
@@ -91,7 +93,7 @@ class ProductMethod:
         all_logits[rows], scores[rows] = logits, result.scores
         mask = np.zeros(len(kept), dtype=bool)
         mask[rows] = estimate.inliers
-        return Answer(estimate.R, estimate.t, all_logits > 0, mask, estimate.failure, all_logits, scores)
+        return Answer(estimate.R, estimate.t, all_logits > 0, mask, estimate.failure, all_logits, scores, **verdict)
 
     def _options(self, seed: int) -> dict[str, Any]:
         """What differs from the defaults of ``filter_matches``."""
@@ -143,14 +145,15 @@ class NetworkOrderMethod:
 def filter_pair(
     pair: ScenePair, rows: NDArray[np.intp], model: str | None, options: dict[str, Any], *, bare: bool = False
 ) -> FilterResult:
-    """What ``filter_matches`` says of the matches ``rows`` (N,); ``bare`` withholds their attributes."""
+    """What ``filter_matches`` says of the matches ``rows`` (N,); ``bare`` withholds all but their positions."""
     from ..match_filter import filter_matches
 
     attributes: MatchAttributes | None = None if bare else pair.attributes.take(rows)
+    scores = None if bare or pair.match_scores is None else pair.match_scores[rows]
     return filter_matches(
         pair.points1[rows],
         pair.points2[rows],
-        None,
+        None if scores is None else scored_matches(scores),
         K1=pair.K1,
         K2=pair.K2,
         size1=pair.image_size1,
@@ -159,6 +162,11 @@ def filter_pair(
         model=model,
         **options,
     )
+
+
+def scored_matches(scores: NDArray[np.float32]) -> list[cv2.DMatch]:
+    """Row i ↔ row i at the distance 1 − score (M,), as OpenCV's ``LightGlueMatcher`` hands its matches over."""
+    return [cv2.DMatch(row, row, 1.0 - float(score)) for row, score in enumerate(scores)]
 
 
 def model_settings(model: str | None, options: dict[str, Any]) -> dict[str, Any]:

@@ -220,4 +220,6 @@ def evaluate_pair(method: Method, pair: ScenePair, seed: int) -> PairOutcome:
         paper=paper,
         counts=counts,
         properties=PairProperties.of(pair, truth),
+        status=answer.status,
+        confidence=answer.confidence,
     )

@@ -3,8 +3,9 @@
 Selections are ``NN`` (every nearest neighbour), ``mutual``, ``ratio 0.8``, ``GMS`` and ``AdaLAM``; estimators
 ``RANSAC``, ``LMEDS`` (no threshold), ``MAGSAC``, ``ACCURATE``, ``PROSAC`` (OpenCV), ``DEGENSAC`` (pydegensac),
 ``PoseLib`` and ``PoseLib progressive``, each with a threshold such as ``0.75 px``. A number of iterations after it
-(``PROSAC 0.5 px 20000 iterations``) makes a time-matched row, which spends them all. ``network order`` in front of
-``PROSAC`` or ``PoseLib progressive`` sorts the matches by the network's scores instead of the ratio. The filter's own
+(``PROSAC 0.5 px 20000 iterations``) makes a time-matched row, which spends them all; ``up to 10000 iterations`` limits
+PoseLib, which stops early where it is certain. ``network order`` in front of ``PROSAC`` or ``PoseLib progressive``
+sorts the matches by the network's scores instead of the ratio, ``list order`` leaves them as they are. The filter's own
 rows are listed in :data:`mgca_filter.evaluation.our_rows.VARIANTS`; a selection before them stands for users who filter
 their matches beforehand.
 """
@@ -14,7 +15,9 @@ from __future__ import annotations
 import re
 
 from .baselines import (
+    LIST_ORDER,
     NEVER_CONFIDENT,
+    UP_TO,
     Baseline,
     DegensacEstimator,
     Estimator,
@@ -86,7 +89,7 @@ PRODUCT_ROWS = (
 
 _ESTIMATOR = re.compile(
     r"(?P<kind>RANSAC|LMEDS|MAGSAC|ACCURATE|PROSAC|DEGENSAC|PoseLib progressive|PoseLib)"
-    r"(?: (?P<px>\d*\.?\d+) px)?(?: (?P<iterations>[1-9]\d*) iterations)?"
+    rf"(?: (?P<px>\d*\.?\d+) px)?(?:(?P<limit> {UP_TO})? (?P<iterations>[1-9]\d*) iterations)?"
 )
 
 
@@ -101,9 +104,9 @@ def parse_method(name: str, model: str | None = None) -> Method:
         ValueError: the name does not follow the grammar.
     """
     *tests, last = [part.strip() for part in name.split("+")]
-    by_network = bool(tests) and tests[-1] == NETWORK_ORDER
-    selection = _parse_selection(tests[:-1] if by_network else tests, name)
-    if last in VARIANTS and not by_network:
+    order = tests[-1] if tests and tests[-1] in (NETWORK_ORDER, LIST_ORDER) else None
+    selection = _parse_selection(tests if order is None else tests[:-1], name)
+    if last in VARIANTS and order is None:
         return ProductMethod(last, selection, model)
     match = _ESTIMATOR.fullmatch(last)
     if match is None or not tests:
@@ -112,10 +115,12 @@ def parse_method(name: str, model: str | None = None) -> Method:
             f"{BASELINE_ROWS[-1]!r}, or one of {', '.join(VARIANTS)}"
         )
     estimator = _build_estimator(match, name)
-    if not by_network:
+    if order is None:
         return Baseline(selection, estimator)
     if not estimator.ordered:
         raise ValueError(f"{name!r}: {estimator.name} has no use for an order; expected PROSAC or PoseLib progressive")
+    if order == LIST_ORDER:
+        return Baseline(selection, estimator, in_list_order=True)
     return NetworkOrderMethod(selection, estimator, model)
 
 
@@ -136,6 +141,8 @@ def _parse_selection(tests: list[str], name: str) -> Selection:
 def _build_estimator(match: re.Match[str], name: str) -> Estimator:
     kind = match["kind"]
     iterations = None if match["iterations"] is None else int(match["iterations"])
+    if match["limit"] is not None and not kind.startswith("PoseLib"):
+        raise ValueError(f"{name!r}: {UP_TO!r} limits PoseLib alone")
     if kind == "LMEDS":
         if match["px"] is not None:
             raise ValueError(f"{name!r}: LMEDS has no threshold, expected none")
@@ -145,7 +152,8 @@ def _build_estimator(match: re.Match[str], name: str) -> Estimator:
         if threshold_px == 0:
             raise ValueError(f"{name!r}: the threshold must be positive")
         if kind.startswith("PoseLib"):
-            return PoseLibEstimator(threshold_px, kind.endswith("progressive"), iterations)
+            budget = {"iterations" if match["limit"] is None else "max_iterations": iterations}
+            return PoseLibEstimator(threshold_px, kind.endswith("progressive"), **budget)
         if kind == "DEGENSAC":
             return DegensacEstimator(threshold_px, iterations)
     if iterations is not None:

@@ -18,6 +18,7 @@ from .metrics import (
     FloatArray,
     SceneErrors,
     ScoreCounts,
+    calibration_gap,
     mean_of_the_nonzero,
     mean_over_pairs,
     mean_over_scenes,
@@ -278,9 +279,7 @@ def reliability_tables(results: Mapping[str, SceneOutcomes]) -> dict[str, Reliab
         if not counts:
             continue
         bins = reliability(counts)
-        matches = sum(one.matches for one in bins)
-        gap = sum(one.matches * abs(one.probability - one.share_right) for one in bins)
-        tables[name] = Reliability(bins, gap / matches if matches else 0.0)
+        tables[name] = Reliability(bins, calibration_gap(bins))
     return tables
 
 

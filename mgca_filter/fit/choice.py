@@ -1,7 +1,9 @@
 """Choice among hypotheses, and the confidence of what was chosen.
 
-The choice is the likelihood of the matches: each is right with a probability that its score gives, and then lies
-about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and anywhere.
+The choice is the likelihood of the matches, each of which is right with a probability that its score gives, and then
+lies about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and
+anywhere. On long lists matches are far from independent and the likelihood is too sure of itself: there the support,
+the summed scores of the matches near by, counts the more, the longer the list is.
 The confidence is a logistic regression on measurements of the chosen hypothesis: how much of the list it explains, how
 far the best *other* answer falls behind, which unlike sources found the same, how firmly its inliers hold it. All
 hypotheses are measured on all distinct matches in one vectorised pass. The numbers are data, a dict of lists of floats,
@@ -37,8 +39,11 @@ AGREEMENT_DEG = (2.0, 5.0, 10.0)
 NOISE_PX = 0.5
 # Shares of right matches in a group, and rounds in which they are found.
 _LEAST_SHARE, _LARGEST_SHARE, _SHARE_ROUNDS = 1e-3, 0.99, 8
+# The support is measured at these distances, pixels, each relative to the best hypothesis' and with this weight.
+_SUPPORT_PX, _SUPPORT_WEIGHTS = (1.0, 2.0, 4.0), (1.0, 1.0, 0.5)
 # Gaps between log-likelihoods are compressed beyond this.
 GAP_UNIT = 3.0
+_TINY = 1e-12
 
 FEATURES = (
     *("log count", "log weighted count", "log share", "log weighted share"),
@@ -70,6 +75,7 @@ COEFFICIENTS = {
     "noise_scales": None,
     "outlier_width_px": 1,
     "seen_behind": 1,
+    "support_weight": 1,
     "early_end": 5,
     "settled": 3,
     "verdict": 2,
@@ -199,6 +205,22 @@ def log_likelihoods(residuals: Residuals, probability: Array, coefficients: Coef
     return np.stack(columns, axis=1)
 
 
+def _support_bonus(residuals: Residuals, weights: Array, coefficients: Coefficients) -> Array:
+    """What the support (H,) adds to the log-likelihood: 0 for a hypothesis that has the most at every distance.
+
+    Args:
+        weights: (N,) what each match counts.
+        coefficients: ``support_weight``, of the logarithm, times the number of matches to the power of one and a half.
+    """
+    front = ~residuals.behind
+    total = np.zeros(len(front))
+    for reach, weight in zip(_SUPPORT_PX, _SUPPORT_WEIGHTS):
+        support = (np.maximum(1.0 - (residuals.distance_px / reach) ** 2, 0.0) * front) @ weights
+        total += weight * support / max(float(support.max()), _TINY)
+    relative = np.maximum(total / sum(_SUPPORT_WEIGHTS), _TINY)
+    return np.asarray(coefficients["support_weight"][0] * len(weights) ** 1.5 * np.log(relative))
+
+
 def prior(scores: Array, coefficients: Coefficients) -> Array:
     """Probability (N,) that a match is right as the likelihood believes it: ``trust · score ** power + floor``."""
     trust, power, floor = coefficients["score_trust"]
@@ -236,7 +258,7 @@ def judge(
     # One scale for all hypotheses: that of the most likely one.
     column = int(np.argmax(by_scale.max(axis=0)))
     likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
-    chosen = int(np.argmax(likelihood))
+    chosen = int(np.argmax(likelihood + _support_bonus(residuals, weights, coefficients)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
     angles = pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[chosen]], hypotheses.t[[chosen]])[:, 0]
     rivals = angles > RIVAL_DEG

@@ -5,8 +5,8 @@ Every rule asks for nearly all of the evidence, so that an ordinary pair stays `
 - *Chance*: random pairings of the same points measure how often a wrong match agrees with the model; a model is
   meaningful when its support is improbable under that rate (number of false alarms, Moisan & Stival 2004).
 - *Line*: a line in one of the images explains 95 % of the inliers to twice the inlier threshold.
-- *Rotation*: so does a rotation alone. *Plane*: so does a homography. Wrong matches that agree with the model
-  by accident, about as many as the same rate foretells, are left out of the 95 %.
+- *Rotation*: so does a rotation alone, and it is the better model of the pair. *Plane*: so does a homography. Wrong
+  matches that agree with the model by accident, about as many as the same rate foretells, are left out of the 95 %.
 - *Intrinsics*: a fundamental matrix, which needs none, explains far more of the fitted matches than E does; or they
   agree markedly better under another focal length (``focal_check.py``).
 """
@@ -33,6 +33,12 @@ EXPLAINED_SHARE = 0.95
 EXPLAINED_THRESHOLD_FACTOR = 2.0
 MAX_ACCIDENTAL_SHARE = 0.3
 INTRINSICS_SUPPORT_FACTOR = 1.5
+# Keypoints are not better than this, and the median of absolute normal deviates times this is their sigma.
+LEAST_NOISE_PX = 0.1
+_TO_SIGMA = 1.4826
+# A match this many sigmas off counts no more than that.
+_GRIC_CUT = 5.0
+_PRICE_OF_DIMENSION = 2.2
 _CHANCE_ROWS = 400
 _TRIM_ROUNDS = 5
 _MODEL_FREEDOM = 5
@@ -118,6 +124,29 @@ def fit_rotation(correspondences: Array, threshold: float) -> Array:
     return R
 
 
+def prefers_rotation(rotation_px: Array, epipolar_px: Array) -> bool:
+    """True where a rotation alone is the better model of the inliers than an essential matrix, noise considered.
+
+    Torr's criterion GRIC (IJCV 2002): squared residuals in units of the noise, cut off far out, and a price for the
+    dimension of the model's manifold, one more for E's, and for its parameters. A camera that moves a little leaves
+    more of the matches than noise would, however few pixels that is.
+
+    Args:
+        rotation_px: (N,) distances of the inliers to the rotation's homography, as ``homography_distance`` gives them;
+            those so far off that they agree with E by accident are left out.
+        epipolar_px: (N,) their Sampson distances to E.
+    """
+    turned = rotation_px < 2.0 * EXPLAINED_THRESHOLD_FACTOR
+    rotation_px, epipolar_px = rotation_px[turned], epipolar_px[turned]
+    count = len(epipolar_px)
+    noise = max(_TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
+    # Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
+    costs = [float(np.minimum((d / noise) ** 2, _GRIC_CUT**2).sum()) for d in (rotation_px, epipolar_px)]
+    # Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
+    price = _PRICE_OF_DIMENSION * count + 2.0 * log(4.0 * count)
+    return costs[0] - costs[1] < price
+
+
 def _unit(rays: Array) -> Array:
     unit: Array = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     return unit
@@ -127,11 +156,12 @@ def explains(distance: Array, threshold: float, support: Support) -> bool:
     """True where a degenerate model explains nearly all inliers, but for those that are there by accident.
 
     Args:
-        distance: (N,) of the inliers to the degenerate model.
+        distance: (N,) of the inliers to the degenerate model, or of more matches.
         threshold: inlier threshold, in the unit of ``distance``; twice as much is allowed.
         support: of the general model that the inliers agree with.
     """
     # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
     accidents = support.chance_count + 2.0 * np.sqrt(support.chance_count)
-    wanted = EXPLAINED_SHARE * (len(distance) - min(accidents, MAX_ACCIDENTAL_SHARE * len(distance)))
+    count = min(len(distance), support.count)
+    wanted = EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
     return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)

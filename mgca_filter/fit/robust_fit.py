@@ -151,7 +151,7 @@ class Search:
             if share > CERTAIN:
                 break
         self._propose_twins()
-        model = self._chosen("before the network")
+        model = self.current("before the network")
         judgement = None if model is None else model.judgement
         return model if judgement is not None and choice.explains_list(judgement, self._coefficients) else None
 
@@ -166,7 +166,7 @@ class Search:
         if alone is not None:
             self._poses = []
             self._propose((alone,))
-            return self._chosen("all sources")
+            return self.current("all sources")
         self._propose(self._plan.first)
         ended = "first sources"
         poselib = self._options.method == "poselib"
@@ -179,7 +179,7 @@ class Search:
             self._propose((POSELIB,) if poselib else ())
         if self._poses:
             self._propose_twins()
-        return self._chosen(ended)
+        return self.current(ended)
 
     def _take(self, evidence: Evidence) -> None:
         self._evidence, self._judgement = evidence, None
@@ -275,7 +275,7 @@ class Search:
             )
         return self._judgement
 
-    def _chosen(self, ended: str) -> TwoViewModel | None:
+    def current(self, ended: str = "") -> TwoViewModel | None:
         """The best of what was found so far, whatever it is worth; None where nothing was."""
         if not self._poses:
             return None

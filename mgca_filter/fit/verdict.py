@@ -1,4 +1,8 @@
-"""From the fitted model to the answer: mask, matrices and status of a pair."""
+"""From the fitted model to the answer: mask, matrices and status of a pair.
+
+In order: is there anything to judge, does a rotation alone explain it, are the intrinsics contradicted, how sure is the
+pose, and where it is not, does a plane explain the pair; else the pose stands, on one plane or not.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.epipolar import fundamental_from_essential, sampson_distance
-from ..geometry.homography import homography_distance
+from ..geometry.homography import homography_distance, sampson_distance_to_homography
+from ..geometry.pose_refinement import direction_uncertainty_deg
 from ..inputs.options import FilterOptions
 from ..inputs.pair import PairInput
 from ..result import Status
@@ -18,12 +23,17 @@ from .choice import Coefficients
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
 from .evidence import MIN_MATCHES, Evidence, distinct_rows
 from .focal_check import better_focal_factor
+from .homography_fit import HomographyOptions, estimate_homography
+from .planarity import MEANINGFUL_LOG10_NFA, find_plane, homography_false_alarms
 from .robust_fit import REFINE_PX, TwoViewModel
 
 Array = NDArray[np.float64]
 
 # The fundamental matrix that may contradict the intrinsics: a run on few, well-chosen matches.
-THRESHOLD_PX, _F_ITERATIONS = 0.5, 1000
+_CONTRADICTION_PX, _CONTRADICTION_ITERATIONS = 1.0, 1000
+# A plane in doubt is looked for quickly first, at a generous threshold.
+_QUICK_PLANE_PX = 3.0
+_PLANE_PX = 2.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +46,7 @@ class Verdict:
     F: Array | None = None
     R: Array | None = None
     t: Array | None = None
+    H: Array | None = None
     info: dict[str, Any] = field(default_factory=dict)
 
 
@@ -71,37 +82,53 @@ def judge(
     fitted = evidence.correspondences[witnesses]
     inlier_rows, inliers = evidence.rows[witnesses[near]], fitted[near]
     if len(inliers) < MIN_MATCHES:
-        return Verdict(Status.NO_GEOMETRY, nothing)
+        return _plane_or(Verdict(Status.NO_GEOMETRY, nothing), pair, evidence, mask_threshold_px, options)
     support = degeneracy.measure_support(fitted, model.M, threshold)
     for part in (inliers[:, :2], inliers[:, 2:]):
         if degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
             return Verdict(Status.NO_GEOMETRY, nothing)
     info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
+    weak = support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA
+    if not weak:
+        turned = _test_rotation(pair, model, evidence.rows[witnesses], near, support, mask_threshold_px, info)
+        if turned is not None:
+            return turned
     suspicious = _contradicts_intrinsics(pair, fitted, support, options)
-    withheld, doubtful = _doubts(model, support, coefficients)
+    withheld, doubtful = _doubts(model, support, weak, coefficients)
     if withheld and not suspicious:
-        return Verdict(Status.UNRELATED, nothing, info=info)
+        unrelated = Verdict(Status.UNRELATED, nothing, info=info)
+        return _plane_or(unrelated, pair, evidence, mask_threshold_px, options)
+    noise = max(float(np.median(sampson_distance(inliers, model.M))), degeneracy.LEAST_NOISE_PX / pair.focal_px)
+    info["translation_sigma_deg"] = direction_uncertainty_deg(inliers, model.R, model.t, noise)
     verdict = _keep_model(pair, model, mask_threshold_px, info)
     if suspicious:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
     if doubtful:
-        return replace(verdict, status=Status.LOW_SUPPORT)
+        plane = _plane_or(verdict, pair, evidence, mask_threshold_px, options)
+        info = {**info, "homography": plane.H} if plane.H is not None else info
+        return replace(verdict, status=Status.LOW_SUPPORT, H=plane.H, info=info)
     factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
     if factor is not None:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
-    return _test_degenerate(pair, inlier_rows, support, mask_threshold_px, options.seed, verdict)
+    return _test_plane(pair, evidence, inlier_rows, support, options, verdict)
 
 
-def _doubts(model: TwoViewModel, support: degeneracy.Support, coefficients: Coefficients) -> tuple[bool, bool]:
-    """Whether the model is to be withheld, and whether it is doubtful.
+def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: float, options: FilterOptions) -> Verdict:
+    """The answer where the caller asks for a homography: the one that the matches support best, if it is no chance.
 
-    The confidence decides; a fundamental matrix, which has none, must be more than chance.
+    Arguments as of :func:`judge`. E, F, R and t are None; the mask holds the matches within the threshold of it.
     """
-    if model.confidence is not None:
-        least, usable = coefficients["verdict"]
-        return model.confidence < least, model.confidence < usable
-    few = support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA
-    return support.log10_nfa > degeneracy.UNRELATED_LOG10_NFA, few
+    nothing = np.zeros(len(pair.valid), dtype=bool)
+    if count_distinct(pair.correspondences[pair.valid]) < 4:
+        return Verdict(Status.TOO_FEW_MATCHES, nothing)
+    rows = np.hstack(pair.pixels(evidence.rows))
+    plane = find_plane(rows, evidence.scores, None, None, options=_plane_options(options))
+    if plane.H is None:
+        return Verdict(Status.NO_GEOMETRY, nothing)
+    info = {"support": plane.count, "log10_false_alarms": plane.log10_false_alarms}
+    if not plane.meaningful:
+        return Verdict(Status.UNRELATED, nothing, info=info)
+    return _keep_homography(pair, plane.H, Status.OK, mask_threshold_px, info)
 
 
 def count_distinct(correspondences: Array) -> int:
@@ -109,16 +136,40 @@ def count_distinct(correspondences: Array) -> int:
     return len(distinct_rows(correspondences))
 
 
+def _doubts(
+    model: TwoViewModel, support: degeneracy.Support, weak: bool, coefficients: Coefficients
+) -> tuple[bool, bool]:
+    """Whether the model is to be withheld, and whether it is doubtful.
+
+    The confidence decides; a fundamental matrix, which has none, must be more than chance.
+    """
+    if model.confidence is not None:
+        least, usable = coefficients["verdict"]
+        return model.confidence < least, model.confidence < usable
+    return support.log10_nfa > degeneracy.UNRELATED_LOG10_NFA, weak
+
+
 def _keep_model(pair: PairInput, model: TwoViewModel, mask_threshold_px: float, info: dict[str, Any]) -> Verdict:
     """The model as it is, with the mask of all matches."""
     F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
     mask = np.zeros(len(pair.valid), dtype=bool)
     if pair.calibrated:
-        distance_px = sampson_distance(pair.correspondences[pair.valid], model.M) * pair.focal_px
+        distance_px = pair.epipolar_distance_px(pair.valid, model.M)
     else:
         distance_px = sampson_distance(np.hstack(pair.pixels(pair.valid)), F)
     mask[pair.valid] = distance_px < mask_threshold_px
-    return Verdict(Status.OK, mask, model.E, pair.fundamental_in_units(F), model.R, model.t, info)
+    return Verdict(Status.OK, mask, model.E, pair.fundamental_in_units(F), model.R, model.t, info=info)
+
+
+def _keep_homography(
+    pair: PairInput, H: Array, status: Status, mask_threshold_px: float, info: dict[str, Any]
+) -> Verdict:
+    """A homography of the pixels as the model, with the mask of all matches."""
+    mask = np.zeros(len(pair.valid), dtype=bool)
+    rows = np.hstack(pair.pixels(pair.valid))
+    mask[pair.valid] = sampson_distance_to_homography(rows, H) < mask_threshold_px
+    H = pair.homography_in_units(H)
+    return Verdict(status, mask, H=H, info={**info, "homography": H})
 
 
 def _contradicts_intrinsics(
@@ -127,7 +178,7 @@ def _contradicts_intrinsics(
     """True where F, which knows no intrinsics, explains far more of the matches (N, 4) than the caller's allow."""
     if not pair.calibrated or 2 * support.count >= len(fitted):
         return False
-    run = EstimatorOptions("prosac", 2.0 * THRESHOLD_PX, options.confidence, _F_ITERATIONS, options.seed)
+    run = EstimatorOptions("prosac", _CONTRADICTION_PX, options.confidence, _CONTRADICTION_ITERATIONS, options.seed)
     F = fit_epipolar(fitted, pair.focal_px, run, calibrated=False)
     if F is None:
         return False
@@ -138,30 +189,76 @@ def _contradicts_intrinsics(
     )
 
 
-def _test_degenerate(
+def _test_rotation(
     pair: PairInput,
-    inlier_rows: NDArray[np.intp],
+    model: TwoViewModel,
+    fitted_rows: NDArray[np.intp],
+    near: NDArray[np.bool_],
     support: degeneracy.Support,
     mask_threshold_px: float,
-    seed: int,
+    info: dict[str, Any],
+) -> Verdict | None:
+    """The verdict where a rotation alone explains as many matches, so that they say nothing of a translation.
+
+    Args:
+        fitted_rows: (N,) rows of the pair's matches that bear witness.
+        near: (N,) bool, those of them that agree with the model.
+    """
+    R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
+    H = pair.intrinsics2.K @ R @ np.linalg.inv(pair.intrinsics1.K)
+    distance_px = homography_distance(*pair.pixels(fitted_rows), H)
+    if not degeneracy.explains(distance_px, REFINE_PX, support):
+        return None
+    epipolar_px = sampson_distance(pair.correspondences[fitted_rows[near]], model.M) * pair.focal_px
+    if pair.calibrated and not degeneracy.prefers_rotation(distance_px[near], epipolar_px):
+        return None
+    verdict = _keep_homography(pair, H, Status.PURE_ROTATION, mask_threshold_px, info)
+    return replace(verdict, R=R)
+
+
+def _test_plane(
+    pair: PairInput,
+    evidence: Evidence,
+    inlier_rows: NDArray[np.intp],
+    support: degeneracy.Support,
+    options: FilterOptions,
     verdict: Verdict,
 ) -> Verdict:
-    """Replace the verdict where a rotation or a plane explains the inliers as well."""
-    threshold_px = REFINE_PX
+    """The verdict with the homography that explains the inliers as well, where there is one."""
     points1, points2 = pair.pixels(inlier_rows)
-    K1, K2 = pair.intrinsics1.K, pair.intrinsics2.K
-    R = degeneracy.fit_rotation(pair.correspondences[inlier_rows], threshold_px / pair.focal_px)
-    H = K2 @ R @ np.linalg.inv(K1)
-    if degeneracy.explains(homography_distance(points1, points2, H), threshold_px, support):
-        mask = np.zeros(len(pair.valid), dtype=bool)
-        mask[pair.valid] = homography_distance(*pair.pixels(pair.valid), H) < mask_threshold_px
-        info = {**verdict.info, "homography": pair.homography_in_units(H)}
-        return Verdict(Status.PURE_ROTATION, mask, R=R, info=info)
-    plane = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * threshold_px, seed)
-    if plane is not None and degeneracy.explains(homography_distance(points1, points2, plane), threshold_px, support):
-        info = {**verdict.info, "homography": pair.homography_in_units(plane)}
-        if pair.calibrated:
-            return replace(verdict, status=Status.PLANAR, info=info)
-        # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
-        return replace(verdict, status=Status.PLANAR, E=None, R=None, t=None, info=info)
-    return verdict
+    quick = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * REFINE_PX, options.seed)
+    if quick is None or not degeneracy.explains(homography_distance(points1, points2, quick), REFINE_PX, support):
+        return verdict
+    H = pair.homography_in_units(_best_homography(pair, evidence, options, quick))
+    planar = replace(verdict, status=Status.PLANAR, H=H, info={**verdict.info, "homography": H})
+    # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
+    return planar if pair.calibrated else replace(planar, E=None, R=None, t=None)
+
+
+def _plane_or(
+    verdict: Verdict, pair: PairInput, evidence: Evidence, mask_threshold_px: float, options: FilterOptions
+) -> Verdict:
+    """A plane that explains a pair whose pose is doubtful, more than chance would; else the verdict as it is."""
+    rows = np.hstack(pair.pixels(evidence.rows))
+    sharp = rows[evidence.accepted()]
+    quick = fit_homography(sharp[:, :2], sharp[:, 2:], _QUICK_PLANE_PX, options.seed, ordered=True)
+    if quick is None or homography_false_alarms(sharp, quick, _PLANE_PX) > MEANINGFUL_LOG10_NFA:
+        return verdict
+    H = _best_homography(pair, evidence, options, quick)
+    log10_nfa = homography_false_alarms(rows, H, _PLANE_PX)
+    agreeing = int(np.count_nonzero(sampson_distance_to_homography(sharp, H) < _PLANE_PX))
+    if log10_nfa > MEANINGFUL_LOG10_NFA or agreeing < degeneracy.MIN_SUPPORT:
+        return verdict
+    info = {**verdict.info, "support": agreeing, "log10_false_alarms": log10_nfa}
+    return _keep_homography(pair, H, Status.PLANAR, mask_threshold_px, info)
+
+
+def _best_homography(pair: PairInput, evidence: Evidence, options: FilterOptions, quick: Array) -> Array:
+    """The homography (3, 3) of the pixels that the matches support best; ``quick`` where none is found."""
+    rows = np.hstack(pair.pixels(evidence.rows))
+    fit = estimate_homography(rows, _plane_options(options), evidence.scores)
+    return quick if fit is None else fit.H
+
+
+def _plane_options(options: FilterOptions) -> HomographyOptions:
+    return HomographyOptions(threshold=_PLANE_PX, confidence=options.confidence, seed=options.seed)

@@ -37,13 +37,22 @@ def homogeneous(points: ArrayLike) -> FloatArray:
     return np.concatenate([p, np.ones((len(p), 1))], axis=1)
 
 
-def _epipolar_terms(correspondences: ArrayLike, E: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Algebraic error (N,) and the squared norms (N,) of the epipolar line normals in image 2 and 1."""
+def _epipolar_terms(
+    correspondences: ArrayLike, E: ArrayLike, stretch1: FloatArray | None = None, stretch2: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Algebraic error (N,) and the squared norms (N,) of its derivatives by the points of image 2 and 1.
+
+    These are the normals of the epipolar lines, or, through the lenses, the derivatives by what was seen.
+    """
     c = np.asarray(correspondences, dtype=np.float64)
     x1, x2 = homogeneous(c[:, :2]), homogeneous(c[:, 2:4])
     E = np.asarray(E, dtype=np.float64)
     line2, line1 = x1 @ E.T, x2 @ E
     normal2, normal1 = line2[:, :2], line1[:, :2]
+    if stretch1 is not None:
+        normal1 = np.einsum("ni,nij->nj", normal1, stretch1)
+    if stretch2 is not None:
+        normal2 = np.einsum("ni,nij->nj", normal2, stretch2)
     return _row_products(x2, line2), _row_products(normal2, normal2), _row_products(normal1, normal1)
 
 
@@ -63,13 +72,20 @@ def symmetric_epipolar_distance_squared(correspondences: ArrayLike, E: ArrayLike
     return error**2 * (1.0 / np.maximum(n2, tiny) + 1.0 / np.maximum(n1, tiny))
 
 
-def sampson_distance(correspondences: ArrayLike, E: ArrayLike) -> FloatArray:
+def sampson_distance(
+    correspondences: ArrayLike, E: ArrayLike, stretch1: FloatArray | None = None, stretch2: FloatArray | None = None
+) -> FloatArray:
     """First-order distance (N,) to the epipolar geometry, in the unit of the coordinates.
 
     |x2^T E x1| / sqrt(|E x1|^2_12 + |E^T x2|^2_12) (Hartley & Zisserman, 2nd ed., eq. 11.9).
     Works for F and pixels as well.
+
+    Args:
+        correspondences: (N, 4). E: (3, 3).
+        stretch1, stretch2: (N, 2, 2), derivatives of the points by where the lens showed them, or None = none: the
+            distance is then that in the distorted images.
     """
-    error, n2, n1 = _epipolar_terms(correspondences, E)
+    error, n2, n1 = _epipolar_terms(correspondences, E, stretch1, stretch2)
     return np.abs(error) / np.sqrt(np.maximum(n2 + n1, np.finfo(np.float64).tiny))
 
 

@@ -87,6 +87,22 @@ def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> fl
     return float(np.clip(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 1e-3, 90.0))
 
 
+def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> float:
+    """Standard deviation of the direction of translation along its worst direction, degrees; at most 90.
+
+    Arguments as of :func:`pose_uncertainty_deg`; what the rotation takes up of the same residuals is accounted for.
+    """
+    if len(inliers) < MIN_INLIERS:
+        return 90.0
+    _, J = SampsonTerms(inliers, R, t).linearise(np.ones(len(inliers), dtype=bool))
+    information = J.T @ J
+    rotation, cross, direction = information[:3, :3], information[:3, 3:], information[3:, 3:]
+    damping = _SMALLEST_CURVATURE * np.eye(3)
+    marginal = direction - cross.T @ np.linalg.solve(rotation + damping, cross)
+    curvature = float(np.linalg.eigvalsh(marginal)[0])
+    return float(min(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 90.0))
+
+
 class SampsonTerms:
     """Sampson distances of matches (N, 4) to a pose, and how they change with it; column by column, which is fastest.
 

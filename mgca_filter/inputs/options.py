@@ -13,6 +13,7 @@ from ..types import Providers
 
 METHODS = ("auto", "poselib", "prosac", "magsac", "ransac", "none")
 EFFORTS = ("auto", "full")
+GEOMETRIES = ("auto", "essential", "fundamental", "homography")
 # OpenCV's flags of the estimators that have the same names here.
 _FLAGS = {cv2.USAC_MAGSAC: "magsac", cv2.USAC_PROSAC: "prosac", cv2.RANSAC: "ransac"}
 
@@ -27,6 +28,7 @@ class FilterOptions:
         confidence: of the robust fit, between 0 and 1.
         method: one of :data:`METHODS`.
         effort: one of :data:`EFFORTS`.
+        geometry: one of :data:`GEOMETRIES`.
         max_iterations: largest number of samples that one run of a robust estimator draws.
         seed: of every random choice.
 
@@ -39,6 +41,7 @@ class FilterOptions:
     confidence: float = 0.999
     method: str = "auto"
     effort: str = "auto"
+    geometry: str = "auto"
     max_iterations: int = 5000
     seed: int = 0
 
@@ -49,6 +52,7 @@ class FilterOptions:
         check_number(self.confidence, "confidence", 0.0, 1.0)
         check_choice(self.method, METHODS, "method")
         check_choice(self.effort, EFFORTS, "effort")
+        check_choice(self.geometry, GEOMETRIES, "geometry")
         check_integer(self.max_iterations, "max_iterations", 1)
         check_integer(self.seed, "seed", 0)
 

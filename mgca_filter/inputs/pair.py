@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..geometry.cameras import Intrinsics, mean_focal_length, resolve_intrinsics
+from ..geometry.cameras import Fisheye, Intrinsics, lens_doubt, mean_focal_length, resolve_intrinsics
+from ..geometry.epipolar import sampson_distance
 from ..types import MatchesLike, MatrixLike, PointsLike, SizeLike
 from .attributes import MatchAttributes
 from .keypoints import Keypoints, read_keypoints
 from .matches import PutativeMatches, read_matches
+from .options import check_number
 
 # Coordinates are taken for pixels unless both the focal length and the extent of the keypoints are smaller than any
 # camera's, as where the caller normalised the points or measures in millimetres on the sensor. Without a focal length
@@ -30,18 +32,29 @@ _MAX_NORMALIZED = 1e3
 
 @dataclass(frozen=True)
 class MatchPair:
-    """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`."""
+    """Everything that the caller knows of one pair of images; fields as the arguments of :func:`filter_matches`.
+
+    ``resolution``: pixels of the original per pixel of the image in which the keypoints were found; larger than 1 where
+    they were found in a smaller copy.
+
+    ``stretch1``, ``stretch2``: of keypoints that were freed of distortion before, the derivatives (N, 2, 2) of the
+    undistorted pixels by the pixels as they were found, NaN where unknown: the threshold is then in pixels of the
+    distorted images. What ``dist1`` and ``dist2`` say has precedence.
+    """
 
     kp1: PointsLike
     kp2: PointsLike
     matches: MatchesLike | None
     K1: MatrixLike | None = None
     K2: MatrixLike | None = None
-    dist1: ArrayLike | None = None
-    dist2: ArrayLike | None = None
+    dist1: ArrayLike | Fisheye | None = None
+    dist2: ArrayLike | Fisheye | None = None
     size1: SizeLike | None = None
     size2: SizeLike | None = None
     attributes: MatchAttributes | None = None
+    resolution: float = 1.0
+    stretch1: ArrayLike | None = None
+    stretch2: ArrayLike | None = None
 
 
 @dataclass(frozen=True)
@@ -57,10 +70,13 @@ class PairInput:
         order: (M,) float64, ascending = promising: the ratio where it is known, else the descriptor distance; NaN where
             neither is.
         intrinsics1, intrinsics2: cameras, given or guessed, in pixels.
-        unit_px: pixels to a unit of the caller's coordinates: 1, or where these are normalised or millimetres, the
-            number that makes pixels of them.
-        largest_threshold: a threshold above this is in pixels already, whatever the unit.
+        unit_px: pixels to a unit of the caller's coordinates, pixels being those of the image in which the keypoints
+            were found: 1; of a smaller copy 1 / ``resolution``; where the coordinates are normalised or millimetres,
+            the number that makes pixels of them.
+        largest_threshold: a threshold above this is in those pixels already, whatever the unit.
         assumptions: sentences on what was assumed.
+        stretch1, stretch2: (M, 2, 2) derivatives of the undistorted pixels by the pixels that were found; None where
+            lenses distort nothing.
     """
 
     matches: PutativeMatches
@@ -73,8 +89,10 @@ class PairInput:
     intrinsics1: Intrinsics
     intrinsics2: Intrinsics
     unit_px: float = 1.0
-    largest_threshold: float = float("inf")
+    largest_threshold: float = 0.0
     assumptions: tuple[str, ...] = ()
+    stretch1: NDArray[np.float64] | None = None
+    stretch2: NDArray[np.float64] | None = None
 
     @property
     def calibrated(self) -> bool:
@@ -86,8 +104,31 @@ class PairInput:
         """Mean focal length in pixels."""
         return mean_focal_length(self.intrinsics1.K, self.intrinsics2.K)
 
+    def with_focal(self, factor: float) -> PairInput:
+        """The pair under the guessed focal length times ``factor``, taken for the truth from now on."""
+        zoom = np.diag([factor, factor, 1.0])
+        cameras = []
+        for camera in (self.intrinsics1, self.intrinsics2):
+            K = camera.K.copy()
+            K[:2, :2] = K[:2, :2] @ zoom[:2, :2]
+            cameras.append(replace(camera, K=K, guessed=False))
+        return replace(
+            self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
+        )
+
+    def epipolar_distance_px(
+        self, rows: NDArray[np.intp] | NDArray[np.bool_], E: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Sampson distance (K,) of a selection of matches to E (3, 3), in pixels as they were found.
+
+        Through a lens the derivative of the lens counts: near the rim of a fisheye a pixel is a long way on the image
+        plane.
+        """
+        stretch1, stretch2 = (None if s is None else s[rows] for s in (self.stretch1, self.stretch2))
+        return sampson_distance(self.correspondences[rows], E, stretch1, stretch2) * self.focal_px
+
     def threshold_px(self, threshold: float) -> float:
-        """The caller's threshold in pixels."""
+        """The caller's threshold in pixels of the image in which the keypoints were found."""
         return threshold if threshold > self.largest_threshold else threshold * self.unit_px
 
     def fundamental_in_units(self, F: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -122,17 +163,25 @@ def prepare_pair(pair: MatchPair) -> PairInput:
     _check_shared_camera(pair)
     given1, given2 = resolve_intrinsics(keypoints1.points, keypoints2.points, **cameras)
     extent = max(_extent(keypoints1.points), _extent(keypoints2.points))
+    resolution = check_number(pair.resolution, "resolution", 0.0, float("inf"))
     unit_px, yardstick = _pixels_per_unit(given1, given2, extent)
+    in_pixels = unit_px == 1.0
+    if in_pixels:
+        unit_px = 1.0 / resolution
     points1, points2 = keypoints1.points * unit_px, keypoints2.points * unit_px
     if unit_px == 1.0:
         intrinsics1, intrinsics2 = given1, given2
-    elif given1.guessed:
+    elif given1.guessed and not in_pixels:
         intrinsics1, intrinsics2 = resolve_intrinsics(points1, points2)
     else:
         zoom = np.diag([unit_px, unit_px, 1.0])
         intrinsics1, intrinsics2 = (replace(camera, K=zoom @ camera.K) for camera in (given1, given2))
     assumptions = [camera.assumption for camera in (intrinsics1, intrinsics2) if camera.assumption]
-    if unit_px != 1.0:
+    if in_pixels and resolution != 1.0:
+        assumptions.append(
+            f"thresholds are in pixels of the image in which the keypoints were found, {resolution:.3g} of K's to one"
+        )
+    if not in_pixels:
         assumptions.append(
             f"coordinates are no pixels, they extend over {extent:.3g}: thresholds are those of an image in which "
             f"{yardstick:.3g} is {_USUAL_PIXELS:g} pixels"
@@ -142,6 +191,10 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         for i, camera, size in ((1, given1, pair.size1), (2, given2, pair.size2))
         if not camera.guessed and size is not None and not _inside(camera.K[:2, 2], size)
     ]
+    for i, camera, points in ((1, given1, keypoints1.points), (2, given2, keypoints2.points)):
+        doubt = lens_doubt(camera, points, i)
+        if doubt is not None:
+            assumptions.append(doubt)
     present = (putative.index1 >= 0)[:, None]
     if present.any():
         ends = [
@@ -170,9 +223,36 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         intrinsics1,
         intrinsics2,
         unit_px,
-        _LARGEST_THRESHOLD_SHARE * yardstick if unit_px != 1.0 else float("inf"),
+        0.0 if in_pixels else _LARGEST_THRESHOLD_SHARE * yardstick,
         tuple(assumptions),
+        _stretch_of_matches(pair.stretch1, "stretch1", intrinsics1, points1, putative.index1),
+        _stretch_of_matches(pair.stretch2, "stretch2", intrinsics2, points2, putative.index2),
     )
+
+
+def _stretch_of_matches(
+    given: ArrayLike | None,
+    name: str,
+    camera: Intrinsics,
+    points: NDArray[np.float64],
+    index: NDArray[np.intp],
+) -> NDArray[np.float64] | None:
+    """Derivatives (M, 2, 2) of the undistorted pixels of each match by those that were found; None without distortion.
+
+    Where the derivative is not known, that of no distortion stands.
+    """
+    stretch = camera.stretch(points)
+    if stretch is None:
+        if given is None:
+            return None
+        stretch = np.asarray(given, dtype=np.float64)
+        if stretch.shape != (len(points), 2, 2):
+            raise ValueError(f"{name}: expected shape ({len(points)}, 2, 2) like the keypoints, got {stretch.shape}")
+    if len(points) == 0:
+        return np.tile(np.eye(2), (len(index), 1, 1))
+    of_matches = stretch[index]
+    known = np.isfinite(of_matches).all(axis=(1, 2), keepdims=True)
+    return np.where(known, of_matches, np.eye(2))
 
 
 def _order(known: MatchAttributes, matches: PutativeMatches) -> NDArray[np.float64]:

@@ -21,9 +21,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from .journal import Journal, PipelineError, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow, Unusable
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import PairRow, Unusable
 
 HALF_PIXEL = 0.5
 # COLMAP's own guess for a camera of which nothing is known.
@@ -32,6 +33,9 @@ _GUESSED_FOCAL_FACTOR = 1.2
 _SQLITE_BUSY, _SQLITE_LOCKED = 5, 6
 # Pixels of COLMAP to pixels of OpenCV, homogeneous.
 _TO_OPENCV = np.array([[1.0, 0.0, -HALF_PIXEL], [0.0, 1.0, -HALF_PIXEL], [0.0, 0.0, 1.0]])
+# Half the width of the difference that stands for a derivative; keypoints are float32.
+_STRETCH_STEP_PX = 0.25
+_PINHOLES = (pycolmap.CameraModelId.SIMPLE_PINHOLE, pycolmap.CameraModelId.PINHOLE)
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 _CONFIGURATIONS = {
     ("ok", True): _Configuration.CALIBRATED,
@@ -51,11 +55,13 @@ class ColmapJob:
         database: read, and changed only where ``output`` is the same path.
         output: gets everything that ``database`` holds, with our ``two_view_geometries``.
         use_descriptors: compute each match's distance ratio from SIFT descriptors where the database holds them.
+        report: an HTML report of the run, or None.
     """
 
     database: Path
     output: Path
     use_descriptors: bool = True
+    report: Report | None = None
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
@@ -80,6 +86,8 @@ class ColmapJob:
                 summary = run_pairs(source, workers, journal, quiet)
                 write_geometries(database, source.ids, journal.rows())
             self._deliver(copy)
+            if self.report is not None:
+                self.report.write(journal.rows())
         finally:
             journal.close()
         shutil.rmtree(work)
@@ -227,6 +235,7 @@ class DatabaseSource:
             self._sift_descriptors(image_id, len(table)),
             K if camera.has_prior_focal_length else None,
             (camera.width, camera.height),
+            stretch=stretch(camera, table[:, :2]),
         )
 
     def _sift_descriptors(self, image_id: int, count: int) -> NDArray[np.uint8] | None:
@@ -260,6 +269,17 @@ def undistorted(camera: Any, points: NDArray[Any]) -> NDArray[np.float64]:
     on_plane = np.asarray(camera.cam_from_img(points.astype(np.float64)), dtype=np.float64).reshape(-1, 2)
     pixels: NDArray[np.float64] = on_plane * K[[0, 1], [0, 1]] + K[:2, 2]
     return pixels
+
+
+def stretch(camera: Any, points: NDArray[Any]) -> NDArray[np.float64] | None:
+    """Derivatives (N, 2, 2) of :func:`undistorted` by the keypoints (N, 2); None for a camera without distortion."""
+    if camera.model in _PINHOLES:
+        return None
+    columns = [
+        (undistorted(camera, points + step) - undistorted(camera, points - step)) / (2.0 * _STRETCH_STEP_PX)
+        for step in _STRETCH_STEP_PX * np.eye(2)
+    ]
+    return np.stack(columns, axis=2)
 
 
 def keypoint_shapes(table: NDArray[Any]) -> tuple[NDArray[Any] | None, NDArray[Any] | None]:
@@ -319,14 +339,14 @@ def write_database(
     names: Sequence[str],
     read: Callable[[str], ImageFeatures | None],
     rows: Iterable[PairRow],
-    K: NDArray[np.float64] | None,
+    camera_model: str = "PINHOLE",
 ) -> None:
     """Cameras, images, keypoints, descriptors where they are bytes long, kept matches and two-view geometries.
 
     Args:
-        path: the file to make. names: images; those that ``read`` has no features for are left out.
-        K: (3, 3) intrinsics in OpenCV's pixels of one pinhole camera for all images of a size, or None: one
-            SIMPLE_RADIAL camera per image, of guessed focal length.
+        path: the file to make. names: images; those that ``read`` has no features for are left out. Images of the same
+            intrinsics share a camera; those without have a SIMPLE_RADIAL camera each, of guessed focal length.
+        camera_model: of images with intrinsics, "PINHOLE", or "SIMPLE_RADIAL" where these are rough.
 
     Raises:
         PipelineError: the disk is full.
@@ -334,24 +354,25 @@ def write_database(
     try:
         with closing(pycolmap.Database.open(path)) as database:
             with pycolmap.DatabaseTransaction(database):
-                ids = _write_images(database, names, read, K)
+                ids = _write_images(database, names, read, camera_model)
             write_geometries(database, ids, _with_matches(database, ids, rows))
     except (RuntimeError, ValueError) as error:
         raise PipelineError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
 def _write_images(
-    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], K: NDArray[np.float64] | None
+    database: Any, names: Sequence[str], read: Callable[[str], ImageFeatures | None], camera_model: str
 ) -> dict[str, int]:
     ids: dict[str, int] = {}
-    cameras: dict[tuple[int, int], int] = {}
+    cameras: dict[tuple[Any, ...], int] = {}
     for name in names:
         image = read(name)
         if image is None or image.image_size is None:
             continue
-        if K is None or image.image_size not in cameras:
-            cameras[image.image_size] = database.write_camera(_camera(image.image_size, K))
-        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[image.image_size]))
+        key = (name,) if image.K is None else (*image.image_size, *image.K.ravel())
+        if key not in cameras:
+            cameras[key] = database.write_camera(_camera(image.image_size, image.K, camera_model))
+        ids[name] = database.write_image(pycolmap.Image(name=name, camera_id=cameras[key]))
         table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
         database.write_keypoints(ids[name], table.astype(np.float32))
         if image.descriptors is not None and image.descriptors.shape[1:] == (128,):
@@ -370,13 +391,14 @@ def _angle(image: ImageFeatures) -> NDArray[Any]:
     return np.zeros(len(image.points)) if image.angle is None else image.angle
 
 
-def _camera(size: tuple[int, int], K: NDArray[np.float64] | None) -> Any:
+def _camera(size: tuple[int, int], K: NDArray[np.float64] | None, model: str) -> Any:
     width, height = size
     if K is None:
         params = [_GUESSED_FOCAL_FACTOR * max(size), width / 2, height / 2, 0.0]
         return pycolmap.Camera(model="SIMPLE_RADIAL", width=width, height=height, params=params)
-    params = [K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL]
-    camera = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + HALF_PIXEL, K[1, 2] + HALF_PIXEL
+    params = [fx, fy, cx, cy] if model == "PINHOLE" else [fx, cx, cy, 0.0]
+    camera = pycolmap.Camera(model=model, width=width, height=height, params=params)
     camera.has_prior_focal_length = True
     return camera
 

@@ -11,9 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from ..features import ImageFeatures, detector_resolution
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
-from .worker import ImageFeatures
+
+# Of what is in a file; another one, and all images are read again.
+_REVISION = 2
+_UNREADABLE = (OSError, ValueError, KeyError, zipfile.BadZipFile)
 
 
 @dataclass(frozen=True)
@@ -54,22 +58,36 @@ class FeatureCache:
         try:
             with np.load(self._path(name)) as data:
                 table, descriptors, (width, height) = data["keypoints"], data["descriptors"], data["image_size"]
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile):
+                K = data["K"]
+        except _UNREADABLE:
             return None
-        return ImageFeatures(table[:, :2], table[:, 2], table[:, 3], descriptors, None, (int(width), int(height)))
+        size = (int(width), int(height))
+        return ImageFeatures(
+            table[:, :2], table[:, 2], table[:, 3], descriptors, K if K.size else None, size, detector_resolution(size)
+        )
+
+    def size(self, name: str) -> tuple[int, int] | None:
+        """(width, height) of an image in pixels; None where there are no features of it."""
+        try:
+            with np.load(self._path(name)) as data:
+                width, height = data["image_size"]
+        except _UNREADABLE:
+            return None
+        return int(width), int(height)
 
     def _write(self, name: str, features: ImageFeatures) -> None:
         size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))
         with output_file(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(
                 file,
-                keypoints=np.column_stack([features.points, size, angle]),
+                keypoints=np.column_stack([features.points, size, angle]).astype(np.float32),
                 descriptors=descriptors,
                 image_size=np.array(features.image_size),
+                K=np.zeros((0, 0)) if features.K is None else features.K,
             )
 
     def _path(self, name: str) -> Path:
-        key = repr((name, file_stamp(self.images / name), self.detector, self.max_keypoints))
+        key = repr((_REVISION, name, file_stamp(self.images / name), self.detector, self.max_keypoints))
         return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.npz"
 
 

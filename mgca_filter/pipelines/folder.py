@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..images import intrinsics_doubts
+from ..features import ImageFeatures
+from ..images import principal_point_doubt
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import ImageFeatures, PairRow, Unusable
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import PairRow, Unusable
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
 SUFFIXES = frozenset((".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".ppm", ".pgm", ".jp2"))
@@ -78,31 +80,65 @@ def read_pairs(path: Path, names: Sequence[str], folder: Path) -> list[tuple[str
 
 @dataclass(frozen=True)
 class FolderSource:
-    """Pairs of images whose features lie in a cache; one camera for all images, or none.
+    """Pairs of images whose features lie in a cache.
 
-    ``sizes`` (width, height) are those of the images that were read.
+    Attributes:
+        K: (3, 3) intrinsics of the images of ``K_size`` (width, height), all others are matched without; or None.
+        exif: without ``K``, take the intrinsics that the EXIF of each image gives.
     """
 
     cache: FeatureCache
     pair_names: Sequence[tuple[str, str]]
-    K: NDArray[np.float64] | None
-    sizes: set[tuple[int, int]] = field(default_factory=set)
+    K: NDArray[np.float64] | None = None
+    K_size: tuple[int, int] | None = None
+    exif: bool = True
 
     def pairs(self) -> Sequence[tuple[str, str]]:
         """Names of the images, relative to their folder."""
         return self.pair_names
 
-    def image(self, name: str) -> ImageFeatures | Unusable:
-        """Features from the cache."""
+    def features(self, name: str) -> ImageFeatures | None:
+        """Features from the cache, with the intrinsics that the image is matched with."""
         features = self.cache.read(name)
         if features is None:
-            return Unusable(f"{name}: no features, the image cannot be read")
-        if features.image_size is not None:
-            self.sizes.add(features.image_size)
-        return replace(features, K=self.K)
+            return None
+        if self.K is None:
+            return features if self.exif else replace(features, K=None)
+        return replace(features, K=self.K if features.image_size == self.K_size else None)
+
+    def image(self, name: str) -> ImageFeatures | Unusable:
+        """The features, or why there are none."""
+        features = self.features(name)
+        return Unusable(f"{name}: no features, the image cannot be read") if features is None else features
 
     def matches(self, name1: str, name2: str) -> None:
         """None: nearest neighbours of the descriptors."""
+
+
+def camera_size(
+    K: NDArray[np.float64], sizes: Mapping[str, tuple[int, int]]
+) -> tuple[tuple[int, int] | None, list[str]]:
+    """The size (width, height) that one K (3, 3) is taken to belong to, the commonest of the images', and what is odd.
+
+    Args:
+        sizes: (width, height) of the images by name.
+
+    Returns:
+        The size, None without images; and lines that name the images of other sizes, and say where the principal point
+        is far from the middle.
+    """
+    if not sizes:
+        return None, []
+    counts = Counter(sizes.values())
+    size = max(counts, key=lambda each: (counts[each], each))
+    doubts = []
+    others = sorted(name for name, other in sizes.items() if other != size)
+    if others:
+        few = ", ".join(f"{name} ({sizes[name][0]} x {sizes[name][1]})" for name in others[:3])
+        more = f" and {len(others) - 3} more" if len(others) > 3 else ""
+        doubts.append(f"one K is that of one size, here {size[0]} x {size[1]}: matched without it: {few}{more}")
+    far = principal_point_doubt(K, size)
+    return size, doubts if far is None else [*doubts, far]
 
 
 @dataclass(frozen=True)
@@ -113,9 +149,12 @@ class FolderJob:
         images: the folder. pairs: names of images, relative to it.
         output: ``.db`` (COLMAP), ``.h5`` (hloc's matches; its features lie beside it as ``NAME.features.h5``) or
             ``.jsonl`` (one object per pair).
-        K: (3, 3) intrinsics that all images share, in pixels, or None: the focal length is guessed.
+        K: (3, 3) intrinsics of the images, in pixels, or None: they are those of ``exif``, or guessed. Images of
+            another size than most are matched without.
         detector, max_keypoints: as in :func:`mgca_filter.match_images`.
         cache: folder that keeps the features for other runs, or None: beside the output until the run is done.
+        report: an HTML report of the run, or None.
+        exif: without ``K``, take the focal length that the EXIF of each image gives.
     """
 
     images: Path
@@ -125,6 +164,8 @@ class FolderJob:
     detector: str = "sift"
     max_keypoints: int = 2000
     cache: Path | None = None
+    report: Report | None = None
+    exif: bool = True
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Extract what the cache lacks, filter all pairs, write the output; a killed run goes on where it stopped.
@@ -135,29 +176,42 @@ class FolderJob:
         work = work_folder(self.output)
         journal = Journal(work / "journal.log")
         features = {"detector": self.detector, "max_keypoints": self.max_keypoints}
-        camera = {"K": None if self.K is None else self.K.tolist()}
+        camera = {"K": None if self.K is None else self.K.tolist(), "exif": self.exif}
         try:
             folder = {"images": str(self.images.resolve())}
             journal.begin({**folder, **features, **camera, **run_identity(filter_options)})
             cache = FeatureCache(self.cache or work / "features", self.images, self.detector, self.max_keypoints)
             names = sorted({name for pair in self.pairs for name in pair})
             cache.fill(names, workers, quiet)
-            source = FolderSource(cache, self.pairs, self.K)
+            source, doubts = self._source(cache, names)
             summary = run_pairs(source, workers, journal, quiet)
-            self._write(names, cache.read, journal)
+            self._write(names, source.features, self._rows(journal))
+            if self.report is not None:
+                self.report.write(self._rows(journal))
         finally:
             journal.close()
         shutil.rmtree(work)
-        return summary if self.K is None else replace(summary, doubts=intrinsics_doubts(self.K, source.sizes))
+        return replace(summary, doubts=doubts)
 
-    def _write(self, names: Sequence[str], read: ReadFeatures, journal: Journal) -> None:
+    def _source(self, cache: FeatureCache, names: Sequence[str]) -> tuple[FolderSource, list[str]]:
+        """The pairs with their intrinsics, and what is odd about these."""
+        if self.K is None:
+            return FolderSource(cache, self.pairs, exif=self.exif), []
+        sizes = {name: size for name in names if (size := cache.size(name)) is not None}
+        size, doubts = camera_size(self.K, sizes)
+        return FolderSource(cache, self.pairs, self.K, size), doubts
+
+    def _rows(self, journal: Journal) -> Iterator[PairRow]:
+        """Rows of the pairs that are asked for; a run that was killed may have been asked for others."""
         wanted = set(self.pairs)
-        rows = (row for row in journal.rows() if (row.name1, row.name2) in wanted)
+        return (row for row in journal.rows() if (row.name1, row.name2) in wanted)
+
+    def _write(self, names: Sequence[str], read: ReadFeatures, rows: Iterable[PairRow]) -> None:
         with output_file(self.output) as partial:
             if self.output.suffix == ".db":
                 from .colmap import write_database
 
-                write_database(partial, names, read, rows, self.K)
+                write_database(partial, names, read, rows, "SIMPLE_RADIAL" if self.K is None else "PINHOLE")
             elif self.output.suffix == ".h5":
                 from .hloc import write_features, write_matches
 
@@ -171,9 +225,9 @@ class FolderJob:
 def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) -> None:
     """One JSON object per pair, in the order of the names.
 
-    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``E``, ``F``, ``H``,
-    ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and ``scores`` (K,)
-    of the kept matches, ``message`` for a pair that failed.
+    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``, ``E``,
+    ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
+    ``scores`` (K,) of the kept matches, ``message`` for a pair that failed.
     """
     with path.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(document, allow_nan=False) + "\n" for document in _documents(read, rows))
@@ -190,6 +244,7 @@ def _documents(read: ReadFeatures, rows: Iterable[PairRow]) -> Iterator[dict[str
             "num_matches": row.num_matches,
             "num_inliers": len(row.kept),
             "calibrated": row.calibrated,
+            "confidence": row.confidence,
             **{name: None if matrix is None else matrix.tolist() for name, matrix in matrices.items()},
             "points1": [] if image1 is None else image1.points[row.kept[:, 0]].tolist(),
             "points2": [] if image2 is None else image2.points[row.kept[:, 1]].tolist(),

@@ -20,9 +20,10 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features import ImageFeatures
 from .journal import Journal, PipelineError, file_stamp, output_file
-from .run import Summary, Workers, run_identity, run_pairs, work_folder
-from .worker import FAILED, ImageFeatures, PairRow, Unusable
+from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
+from .worker import FAILED, PairRow, Unusable
 
 _SIFT_LENGTH = 128
 
@@ -35,12 +36,14 @@ class HlocJob:
         features, matches: hloc's files, only read.
         output: gets what ``matches`` holds, with −1 and score 0 where a match is dropped.
         use_descriptors: compute each match's distance ratio where the features are SIFT's.
+        report: an HTML report of the run, or None.
     """
 
     features: Path
     matches: Path
     output: Path
     use_descriptors: bool = True
+    report: Report | None = None
 
     def run(self, workers: Workers, filter_options: dict[str, Any], quiet: bool = False) -> Summary:
         """Filter all pairs, write the output; a killed run goes on where it stopped.
@@ -60,6 +63,8 @@ class HlocJob:
                     shutil.copyfile(self.matches, partial)
                     with h5py.File(partial, "r+") as filtered:
                         drop_matches(filtered, source.groups, journal.rows())
+                if self.report is not None:
+                    self.report.write(journal.rows())
             finally:
                 journal.close()
         shutil.rmtree(work)

@@ -23,7 +23,7 @@ _MAGIC = b"mgca_filter journal 1\n"
 _HEAD = struct.Struct("<II")
 _ARRAYS = {"kept": "<u4", "scores": "<f4", "E": "<f8", "F": "<f8", "H": "<f8", "R": "<f8", "t": "<f8"}
 _MAX_FAILURES = 5
-_PLAIN = ("name1", "name2", "status", "num_matches", "calibrated", "message")
+_PLAIN = ("name1", "name2", "status", "num_matches", "calibrated", "confidence", "message")
 
 
 class PipelineError(MgcaFilterError):

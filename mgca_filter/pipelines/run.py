@@ -20,13 +20,15 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from .. import __version__
+from ..features import ImageFeatures
+from ..html_report.folder_report import PairLine, write_folder_report
 from ..inference.model_file import sha256_of
 from ..match_filter import MatchFilter, model_path
-from .journal import Journal, PipelineError
+from .journal import Journal, PipelineError, output_file
 from .worker import (
     EXPLAINED,
     FAILED,
-    ImageFeatures,
+    PairRow,
     Unusable,
     call_worker,
     call_worker_process,
@@ -224,6 +226,27 @@ class Summary:
         rate = f", {self.pairs_now / self.seconds:.1f} pairs/s" if self.pairs_now and self.seconds > 0 else ""
         resumed = f" ({pairs - self.pairs_now} were done before)" if pairs > self.pairs_now else ""
         return "\n".join([*lines, f"{self.pairs_now} pairs in {self.seconds:.1f} s{rate}{resumed}"])
+
+
+@dataclass(frozen=True)
+class Report:
+    """The HTML report of a run: where it goes, what it calls the collection, and the command that it shows."""
+
+    path: Path
+    title: str
+    command: str
+
+    def write(self, rows: Iterable[PairRow]) -> None:
+        """Write it from all rows.
+
+        Raises:
+            PipelineError: the file cannot be written.
+        """
+        lines = (
+            PairLine(row.name1, row.name2, row.status, row.num_matches, len(row.kept), row.confidence) for row in rows
+        )
+        with output_file(self.path) as partial:
+            write_folder_report(partial, lines, title=self.title, command=self.command)
 
 
 def run_identity(filter_options: dict[str, Any]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -15,35 +15,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..features import create_detector, detect_keypoints, match_descriptors
+from ..exif import exif_intrinsics
+from ..features import (
+    ImageFeatures,
+    attributes_of_matches,
+    create_detector,
+    describe,
+    descriptors_of,
+    keypoint_attributes,
+    match_descriptors,
+)
 from ..images import decode_image
-from ..inputs.attributes import MatchAttributes, best_of_list, distance_ratio
+from ..inputs.attributes import MatchAttributes
+from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
 from ..result import FilterResult, Status
 
 FAILED = "failed"
 # A model of these explains the pair; the matches of all other pairs are dropped.
 EXPLAINED = frozenset(status.value for status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION))
-
-
-@dataclass(frozen=True)
-class ImageFeatures:
-    """What a pipeline knows of one image.
-
-    Attributes:
-        points: (N, 2) pixels, OpenCV's convention; free of distortion where ``K`` is known.
-        size, angle: (N,) diameters in pixels and orientations in degrees, or None.
-        descriptors: (N, D), or None.
-        K: (3, 3) intrinsics, or None.
-        image_size: (width, height) in pixels, or None.
-    """
-
-    points: NDArray[Any]
-    size: NDArray[Any] | None = None
-    angle: NDArray[Any] | None = None
-    descriptors: NDArray[Any] | None = None
-    K: NDArray[np.float64] | None = None
-    image_size: tuple[int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -65,6 +55,7 @@ class PairRow:
         scores: (K,) float32, their probabilities.
         calibrated: the geometry was fitted with known intrinsics.
         E, F, H, R, t: matrices, or None; ``H`` is a homography that explains the pair.
+        confidence: probability that the fitted pose is within 10 degrees, kept or not; None where there is none.
         message: why the pair failed, or "".
     """
 
@@ -80,6 +71,7 @@ class PairRow:
     H: NDArray[np.float64] | None = None
     R: NDArray[np.float64] | None = None
     t: NDArray[np.float64] | None = None
+    confidence: float | None = None
     message: str = ""
 
 
@@ -124,6 +116,7 @@ class PairWorker:
             result.info["intrinsics"] == "given",
             **({name: getattr(result, name) for name in ("E", "F", "R", "t")} if explained else {}),
             H=result.info.get("homography") if explained else None,
+            confidence=result.confidence,
         )
 
     def _run(
@@ -131,22 +124,32 @@ class PairWorker:
     ) -> tuple[FilterResult, NDArray[Any]]:
         """Result and the matches (M, 2) that it is about."""
         if matches is None:
-            candidates: Any = match_descriptors(_described(image1), _described(image2))
+            candidates: Any = match_descriptors(descriptors_of(image1), descriptors_of(image2))
             pairs = np.array([(c[0].queryIdx, c[0].trainIdx) for c in candidates], dtype=np.intp).reshape(-1, 2)
-            known: MatchAttributes | None = _shapes(image1, image2, pairs)
+            known: MatchAttributes | None = keypoint_attributes(image1, image2, pairs[:, 0], pairs[:, 1])
         else:
             candidates, pairs = matches, np.asarray(matches)
-            known = _attributes(image1, image2, pairs)
-        sizes: dict[str, Any] = {"size1": image1.image_size, "size2": image2.image_size, "attributes": known}
+            known = _known_of(image1, image2, pairs)
+        pair = MatchPair(
+            image1.points,
+            image2.points,
+            candidates,
+            size1=image1.image_size,
+            size2=image2.image_size,
+            attributes=known,
+            resolution=max(image1.resolution, image2.resolution),
+        )
         if image1.K is not None and image2.K is not None:
-            result = self._filter.filter(image1.points, image2.points, candidates, K1=image1.K, K2=image2.K, **sizes)
+            known_cameras = replace(pair, K1=image1.K, K2=image2.K, stretch1=image1.stretch, stretch2=image2.stretch)
+            (result,) = self._filter.filter_many([known_cameras])
             if result.status is not Status.SUSPICIOUS_INTRINSICS:
                 return result, pairs
         # Without intrinsics, or with such as the matches contradict, F tells the matches apart.
-        return self._filter.filter(image1.points, image2.points, candidates, **sizes), pairs
+        return self._filter.filter_many([pair])[0], pairs
 
     def extract(self, name: str, encoded: bytes, detector: str, max_keypoints: int) -> tuple[str, ImageFeatures | None]:
-        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too).
+        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too), and K
+        where its EXIF knows the focal length.
 
         None in place of the features of a file that cannot be decoded.
         """
@@ -154,10 +157,8 @@ class PairWorker:
             image = decode_image(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
         except ValueError:
             return name, None
-        keypoints, descriptors = detect_keypoints(image, create_detector(detector, max_keypoints))
-        values = np.array([(*k.pt, k.size, k.angle) for k in keypoints], dtype=np.float32).reshape(-1, 4)
-        height, width = image.shape[:2]
-        return name, ImageFeatures(values[:, :2], values[:, 2], values[:, 3], descriptors, None, (width, height))
+        features = describe(image, create_detector(detector, max_keypoints))
+        return name, replace(features, K=exif_intrinsics(encoded, (image.shape[1], image.shape[0])))
 
 
 def call_worker(filter_options: str, method: str, task: tuple[Any, ...]) -> Any:
@@ -209,59 +210,9 @@ def _failed(name1: str, name2: str, message: str) -> PairRow:
     return PairRow(name1, name2, FAILED, 0, np.zeros((0, 2), np.uint32), np.zeros(0, np.float32), message=message)
 
 
-def _described(image: ImageFeatures) -> NDArray[Any]:
-    if image.descriptors is None:
-        raise ValueError("no matches, and no descriptors to find them with")
-    return image.descriptors
-
-
-def _shapes(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes:
-    """Size and angle of each match (M,), where both images know them."""
-    known = {}
-    for side, image, index in ((1, image1, pairs[:, 0]), (2, image2, pairs[:, 1])):
-        if image.size is None or image.angle is None or len(image.points) == 0:
-            return MatchAttributes()
-        known[f"size{side}"], known[f"angle{side}"] = image.size[index], image.angle[index]
-    return MatchAttributes(**known)
-
-
-def _attributes(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes | None:
+def _known_of(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes | None:
     """What the features tell of given matches; None where these are not pairs of indices, for the filter to refuse."""
-    counts = (len(image1.points), len(image2.points))
+    counts = (len(image1), len(image2))
     if pairs.ndim != 2 or len(pairs) == 0 or pairs.min() < 0 or (pairs.max(axis=0) >= counts).any():
         return None
-    shapes = _shapes(image1, image2, pairs)
-    if image1.descriptors is None or image2.descriptors is None or min(counts) < 2:
-        return shapes
-    distance, nearest_other = descriptor_distances(image1.descriptors, image2.descriptors, pairs)
-    return MatchAttributes(
-        ratio=distance_ratio(distance, nearest_other),
-        best=best_of_list(pairs[:, 1].astype(np.intp), distance),
-        size1=shapes.size1,
-        size2=shapes.size2,
-        angle1=shapes.angle1,
-        angle2=shapes.angle2,
-    )
-
-
-def descriptor_distances(
-    descriptors1: NDArray[Any], descriptors2: NDArray[Any], pairs: NDArray[Any], block: int = 1024
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Euclidean distance (M,) of each match, and that (M,) to the nearest other descriptor of image 2.
-
-    Args:
-        descriptors1, descriptors2: (N1, D), (N2, D), N2 of 2 or more. pairs: (M, 2) indices.
-        block: matches at a time, to bound the memory.
-    """
-    all2 = descriptors2.astype(np.float32)
-    square2 = np.sum(all2 * all2, axis=1)
-    matched, other = np.empty(len(pairs)), np.empty(len(pairs))
-    for first in range(0, len(pairs), block):
-        rows = pairs[first : first + block].astype(np.intp)
-        query = descriptors1[rows[:, 0]].astype(np.float32)
-        squared = np.sum(query * query, axis=1)[:, None] + square2 - 2.0 * (query @ all2.T)  # (block, N2)
-        own = np.arange(len(rows)), rows[:, 1]
-        matched[first : first + block] = squared[own]
-        squared[own] = np.inf
-        other[first : first + block] = squared.min(axis=1)
-    return np.sqrt(np.maximum(matched, 0.0)), np.sqrt(np.maximum(other, 0.0))
+    return attributes_of_matches(image1, image2, pairs)

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 import pytest
 from conftest import make_scene
-from scene_bundles import write_bundle
+from scene_bundles import learned_fields, write_bundle
 
 from benchmarks.study import drawn_pairs, match_pair, paired_cells, result_error_deg, run_study, study_parser
 from mgca_filter import MatchFilter
+from mgca_filter.data.scene_bundle import SceneBundle
 from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation.metrics import FAILURE_DEG, POSE_STATISTICS
 from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
@@ -32,6 +33,16 @@ def test_what_cannot_be_used_is_one_line(error: Exception, capsys: pytest.Captur
 def test_a_fault_of_the_study_is_not_hidden() -> None:
     with pytest.raises(ZeroDivisionError):
         run_study(lambda options: 1 // 0, argparse.Namespace())
+
+
+def test_a_learned_matchers_scores_reach_the_filter_as_distances(tmp_path: Path) -> None:
+    scene = make_scene()
+    pair = SceneBundle(write_bundle(tmp_path / "hall.npz", [scene], **learned_fields([scene])))[0]
+    given = match_pair(pair)
+    assert pair.match_scores is not None
+    np.testing.assert_allclose([match.distance for match in given.matches], 1 - pair.match_scores, atol=1e-6)
+    assert MatchFilter().filter_many([given])[0].ok
+    assert match_pair(SceneBundle(write_bundle(tmp_path / "yard.npz", [scene]))[0]).matches is None
 
 
 def test_studies_run_on_one_thread_and_leave_the_others_as_they_were() -> None:

@@ -1,5 +1,6 @@
 """``mgca-match``: exit status, what goes to which stream, files written, one-line errors."""
 
+import dataclasses
 import json
 import os
 import struct
@@ -11,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from exif_files import FOCAL_35MM, with_exif
 
 import mgca_filter
 from mgca_filter import cli
@@ -170,7 +172,7 @@ K_A, K_B = np.array([[5.0, 0, 3], [0, 6, 4], [0, 0, 1]]), np.array([[7.0, 0, 1],
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], {"detector": "sift", "max_keypoints": 2000, "threshold": 1.0, "method": "prosac", "seed": 0}),
+        ([], {"detector": "sift", "max_keypoints": 2000, "threshold": 1.0, "method": "auto", "seed": 0}),
         ([], {"K1": None, "K2": None, "model": None, "providers": None}),
         (["--detector", "orb"], {"detector": "orb"}),
         (["--max-keypoints", "77"], {"max_keypoints": 77}),
@@ -180,7 +182,7 @@ K_A, K_B = np.array([[5.0, 0, 3], [0, 6, 4], [0, 0, 1]]), np.array([[7.0, 0, 1],
         (["--model", "m.onnx"], {"model": "m.onnx"}),
         (["--providers", "A,B"], {"providers": ["A", "B"]}),
         (["--seed", "9"], {"seed": 9}),
-        (["--K", "5,6,3,4"], {"K1": K_A, "K2": K_A}),
+        (["--K", "5,6,3,4"], {"K1": K_A, "K2": None}),
         (["--K1", "5,6,3,4", "--K2", "7,8,1,2"], {"K1": K_A, "K2": K_B}),
     ],
 )
@@ -236,6 +238,52 @@ def test_wrong_intrinsics(capsys, words):
 )
 def test_misuse_is_one_line_that_names_it(capsys, arguments, words):
     assert_usage_error(capsys, arguments, *words)
+
+
+@pytest.fixture
+def photographs(tmp_path) -> list[str]:
+    """The example pair with the focal length in its EXIF data: 28 mm are 819 px; true are 820."""
+    paths = [tmp_path / "left.jpg", tmp_path / "right.jpg"]
+    for path, source in zip(paths, (LEFT, RIGHT)):
+        path.write_bytes(with_exif(Path(source).read_bytes(), {FOCAL_35MM: 28}))
+    return [str(path) for path in paths]
+
+
+def test_the_focal_length_is_that_of_the_exif_data(photographs, capsys):
+    def found(*words: str) -> dict:
+        assert cli.main([*photographs, "--json", "-", *words]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    exif = found("-q")
+    assert exif["intrinsics"] == "exif"
+    focal = 28 / 35 * 1024
+    np.testing.assert_allclose(exif["K1"], [[focal, 0, 511.5], [0, focal, 383.5], [0, 0, 1]])
+    truth = json.loads((IMAGES / "pair.json").read_text())
+    assert pose_error_deg(exif["R"], exif["t"], truth["R"], truth["t"]) < 2.0
+    assert found("-q", "--no-exif")["intrinsics"] in ("estimated", "guessed")
+    assert found("-q", "--K", K_WORDS)["intrinsics"] == "given"
+    assert cli.main(photographs) == 0
+    assert "focal lengths 819 and 819 px, from EXIF data" in capsys.readouterr().out
+
+
+def test_exif_data_of_one_photograph_are_no_pair_of_cameras(photographs, capsys):
+    assert cli.main([photographs[0], RIGHT, "-q", "--json", "-"]) == 0
+    assert json.loads(capsys.readouterr().out)["intrinsics"] in ("estimated", "guessed")
+
+
+def test_exif_data_that_the_matches_contradict_are_left(photographs, monkeypatch, capsys):
+    from mgca_filter.cli import pair
+
+    def match(*images, **options):
+        matched = mgca_filter.match_images(*images, **options)
+        suspicious = dataclasses.replace(matched.result, status=mgca_filter.Status.SUSPICIOUS_INTRINSICS)
+        return matched if options.get("K1") is None else dataclasses.replace(matched, result=suspicious)
+
+    monkeypatch.setattr(pair, "match_images", match)
+    assert cli.main([*photographs, "--json", "-"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["intrinsics"] in ("estimated", "guessed")
+    assert "the matches contradict the focal length of the EXIF data" in err
 
 
 def test_empty_file_is_named(capsys, tmp_path):

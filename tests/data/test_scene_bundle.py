@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Scene, make_scene
-from scene_bundles import bundle_fields, write_bundle
+from scene_bundles import bundle_fields, learned_fields, write_bundle
 
 from mgca_filter.data.scene_bundle import (
     BundleImage,
@@ -82,6 +82,69 @@ def test_match_index_names_keypoints_of_the_second_image(tmp_path, scenes):
     np.testing.assert_allclose(bundle[1].points1, scenes[1].points1, atol=1e-4)
 
 
+def test_matches_of_a_learned_matcher_come_back_as_written(tmp_path, scenes):
+    changes = learned_fields(scenes)
+    bundle = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes, **changes))
+    assert bundle.match_counts().tolist() == [100, 32]
+    pair, scene = bundle[1], scenes[1]
+    np.testing.assert_allclose(pair.points1, scene.points1[::2], atol=1e-4)
+    np.testing.assert_allclose(pair.points2, scene.points2[::2], atol=1e-4)
+    assert pair.match_scores.dtype == np.float32
+    np.testing.assert_allclose(pair.match_scores, changes["match_score"][100:] / 255.0, rtol=1e-6)
+    np.testing.assert_array_equal(pair.order, 1 - pair.match_scores)
+    assert pair.mutual.all()
+    assert set(vars(pair.attributes).values()) == {None}
+    assert not pair.attributes.encode(32).any()
+
+
+def test_size_and_angle_are_unknown_where_the_detector_gives_none(tmp_path, scenes):
+    for known in (True, False):
+        path = write_bundle(tmp_path / "hall.npz", scenes, has_size_angle=np.bool_(known))
+        attributes = SceneBundle(path)[0].attributes
+        for name in ("size1", "size2", "angle1", "angle2"):
+            assert (getattr(attributes, name) is not None) == known
+        assert attributes.ratio is not None
+        assert attributes.best is not None
+
+
+def test_nearest_neighbours_are_ordered_by_ratio(tmp_path, scenes):
+    pair = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes))[0]
+    assert pair.match_scores is None
+    np.testing.assert_array_equal(pair.order, pair.attributes.ratio)
+    assert replace(pair, attributes=replace(pair.attributes, ratio=None)).order is None
+
+
+@pytest.mark.parametrize("field", ["match_query", "match_score"])
+def test_missing_fields_of_a_learned_matcher_are_named(tmp_path, scenes, field):
+    path = write_bundle(tmp_path / "hall.npz", scenes, **{**learned_fields(scenes), field: None})
+    with pytest.raises(BundleError, match=rf"hall\.npz.*{field}"):
+        SceneBundle(path)
+
+
+@pytest.mark.parametrize("field", ["match_query", "match_index"])
+def test_keypoints_that_a_learned_matcher_cannot_have_seen_are_named(tmp_path, scenes, field):
+    changes = learned_fields(scenes)
+    changes[field] = np.concatenate([changes[field][:-1], [63]]).astype(np.uint16)
+    bundle = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes, **changes))
+    with pytest.raises(BundleError, match=rf"{field} of pair 1"):
+        bundle[1]
+
+
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_selection_takes_all_that_is_known_along(tmp_path, scenes, learned):
+    changes = {"match_label": np.arange(263).astype(np.int8) % 3} if not learned else learned_fields(scenes)
+    pair = SceneBundle(write_bundle(tmp_path / "hall.npz", scenes, **changes))[0]
+    rows = np.array([7, 2, 5])
+    taken = pair.take(rows)
+    for name in ("points1", "points2", "mutual", "order"):
+        np.testing.assert_array_equal(getattr(taken, name), getattr(pair, name)[rows])
+    for name in ("labels", "match_scores"):
+        whole, part = getattr(pair, name), getattr(taken, name)
+        np.testing.assert_array_equal(part, None if whole is None else whole[rows])
+    np.testing.assert_array_equal(taken.attributes.encode(3), pair.attributes.take(rows).encode(3))
+    np.testing.assert_array_equal(taken.correspondences, pair.correspondences[rows])
+
+
 def test_a_pair_may_have_no_matches(tmp_path, scenes):
     changes = {
         "match_offset": np.array([0, 200, 200]),
@@ -135,8 +198,17 @@ def with_value(field: str, value: float) -> dict[str, np.ndarray]:
         ("match_best", {"match_best": np.ones(33)}),
         ("keypoint_offset", {"keypoint_offset": np.array([0, 200, 400])}),
         ("keypoint_offset", {"keypoint_offset": np.array([-1, 200, 400, 463, 526])}),
+        ("has_size_angle", {"has_size_angle": np.ones(4, dtype=bool)}),
         ("keypoint_size", {"keypoint_size": np.zeros(10, dtype=np.float16)}),
         ("keypoint_angle", {"keypoint_angle": np.zeros(10, dtype=np.uint8)}),
+        (
+            "match_query",
+            {**learned_fields([make_scene(seed=0), make_scene(right=50, wrong=13)]), "match_query": np.zeros(5)},
+        ),
+        (
+            "match_score",
+            {**learned_fields([make_scene(seed=0), make_scene(right=50, wrong=13)]), "match_score": np.zeros(5)},
+        ),
     ],
 )
 def test_values_that_cannot_be_are_named(tmp_path, scenes, field, changes):

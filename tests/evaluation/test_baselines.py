@@ -16,12 +16,14 @@ from scene_bundles import write_bundle
 from mgca_filter import filter_matches
 from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.__main__ import main
+from mgca_filter.evaluation.methods import PairOutcome
 from mgca_filter.evaluation.predict import evaluate_pair
 from mgca_filter.evaluation.registry import GRID_ROWS, TIME_MATCHED_ROWS, parse_method
 from mgca_filter.evaluation.selection import Selection
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.attributes import MatchAttributes
 
+LISTED = "ratio 0.9 + list order + PoseLib progressive 0.75 px up to 10000 iterations"
 ORDERED = "mutual + ratio 0.9 + network order + PROSAC 0.5 px"
 
 
@@ -51,7 +53,9 @@ def waving() -> ScenePair:
     return as_pair(dataclasses.replace(scene, points1=points1, points2=points2, attributes=attributes))
 
 
-@pytest.mark.parametrize("name", [*GRID_ROWS, *TIME_MATCHED_ROWS, ORDERED, "AdaLAM + DEGENSAC 1 px 500 iterations"])
+@pytest.mark.parametrize(
+    "name", [*GRID_ROWS, *TIME_MATCHED_ROWS, ORDERED, LISTED, "AdaLAM + DEGENSAC 1 px 500 iterations"]
+)
 def test_a_rows_name_gives_the_row(name: str):
     assert parse_method(name).name == name
 
@@ -155,3 +159,82 @@ def test_what_is_not_installed_is_listed_and_the_rest_runs(
     assert "NN + MAGSAC 1 px" in text
     assert main(arguments) == 2
     assert "pydegensac" in capsys.readouterr().err
+
+
+def scored(pair: ScenePair) -> ScenePair:
+    """The same matches as a learned matcher gives them: scores, no ratios."""
+    assert pair.attributes.ratio is not None
+    attributes = dataclasses.replace(pair.attributes, ratio=None)
+    return dataclasses.replace(pair, attributes=attributes, match_scores=1 - pair.attributes.ratio**2)
+
+
+@pytest.mark.parametrize("words", ["NN", "NN + list order"])
+def test_order_is_that_of_the_ratio_or_of_the_score_or_of_the_list(
+    words: str, pair: ScenePair, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    genuine, captured = cv2.findEssentialMat, []
+
+    def spy(x1: Any, *args: Any, **kwargs: Any) -> Any:
+        captured.append(x1)
+        return genuine(x1, *args, **kwargs)
+
+    monkeypatch.setattr(cv2, "findEssentialMat", spy)
+    assert pair.attributes.ratio is not None
+    ascending = np.argsort(pair.attributes.ratio, kind="stable")
+    expected = pair.correspondences[ascending if words == "NN" else np.arange(len(ascending)), :2]
+    for one in (pair, scored(pair)):
+        assert evaluate_pair(parse_method(f"{words} + PROSAC 0.5 px"), one, 0).error_deg < 5.0
+    for x1 in captured:
+        np.testing.assert_allclose(x1, expected)
+    assert len(captured) == 2
+    settings = [parse_method(f"{words} + PROSAC 0.5 px").settings() for words in ("NN", "NN + list order")]
+    assert settings[0] != settings[1]
+
+
+def test_without_ratio_or_score_only_the_order_of_the_list_is_left(pair: ScenePair) -> None:
+    unknown = dataclasses.replace(pair, attributes=MatchAttributes())
+    assert "ratios" in evaluate_pair(parse_method("NN + PROSAC 0.5 px"), unknown, 0).failure
+    assert evaluate_pair(parse_method("NN + list order + PROSAC 0.5 px"), unknown, 0).error_deg < 5.0
+
+
+def test_poselib_can_be_limited(pair: ScenePair, monkeypatch: pytest.MonkeyPatch) -> None:
+    poselib = pytest.importorskip("poselib")
+    genuine, options = poselib.estimate_relative_pose, []
+    monkeypatch.setattr(poselib, "estimate_relative_pose", lambda *args: options.append(args[4]) or genuine(*args))
+    method = parse_method("NN + PoseLib 1 px up to 10000 iterations")
+    method.run(pair, 0)
+    assert options[0]["max_iterations"] == 10_000
+    assert "min_iterations" not in options[0]
+    assert method.settings()["estimator"]["max_iterations"] == 10_000
+    for name in ("NN + PROSAC 1 px up to 100 iterations", "NN + LMEDS up to 100 iterations"):
+        with pytest.raises(ValueError, match="limits PoseLib alone"):
+            parse_method(name)
+
+
+def test_the_filter_sees_scores_as_distances(
+    pair: ScenePair, model_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = []
+
+    def spy(points1: Any, points2: Any, matches: Any, **options: Any) -> Any:
+        seen.append(matches)
+        return filter_matches(points1, points2, matches, **options)
+
+    monkeypatch.setattr("mgca_filter.match_filter.filter_matches", spy)
+    one = scored(pair)
+    for words in ("product", "product bare"):
+        outcome = evaluate_pair(parse_method(words, str(model_file)), one, 0)
+        assert outcome.error_deg < 5.0
+        assert outcome.status == "ok"
+        assert outcome.confidence is not None
+        assert 0.5 < outcome.confidence <= 1.0
+    assert one.match_scores is not None
+    np.testing.assert_allclose([match.distance for match in seen[0]], 1 - one.match_scores, atol=1e-6)
+    assert [(match.queryIdx, match.trainIdx) for match in seen[0]] == [(i, i) for i in range(200)]
+    assert seen[1] is None
+
+
+def test_baselines_have_neither_status_nor_confidence(pair: ScenePair) -> None:
+    outcome = evaluate_pair(parse_method("NN + PROSAC 0.5 px"), pair, 0)
+    assert (outcome.status, outcome.confidence) == ("", None)
+    assert PairOutcome.from_json(dataclasses.asdict(outcome)) == outcome

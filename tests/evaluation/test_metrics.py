@@ -10,7 +10,10 @@ from hypothesis import strategies as st
 from mgca_filter.evaluation.metrics import (
     FAILURE_DEG,
     POSE_STATISTICS,
+    ReliabilityBin,
     area_under_recall,
+    area_under_roc,
+    calibration_gap,
     mean_average_precision,
     mean_over_pairs,
     mean_over_scenes,
@@ -170,3 +173,24 @@ def test_a_smaller_error_never_lowers_a_figure(errors, name):
     before = statistic(np.array([errors]))
     improved = statistic(np.array([[errors[0] / 2, *errors[1:]]]))
     assert 0.0 <= before <= improved + 1e-12 <= 1.0 + 2e-12
+
+
+def test_area_under_roc_by_hand():
+    # (0.9 right), (0.5 right) against (0.5 wrong), (0.1 wrong): 1, 1, ½ and 1 of the four comparisons
+    assert area_under_roc([0.9, 0.5, 0.5, 0.1], [True, True, False, False]) == pytest.approx(3.5 / 4)
+    assert np.isnan(area_under_roc([0.5, 0.9], [True, True]))
+    assert np.isnan(area_under_roc([], []))
+
+
+@given(st.lists(st.tuples(st.integers(0, 9), st.booleans()), min_size=2))
+def test_area_under_roc_turns_with_the_sign_and_keeps_the_scale(pairs):
+    values, truth = np.array([value for value, _ in pairs], dtype=float), np.array([right for _, right in pairs])
+    area = area_under_roc(values, truth)
+    np.testing.assert_allclose(area_under_roc(-values, truth), 1 - area)
+    np.testing.assert_allclose(area_under_roc(np.exp(values), truth), area)
+
+
+def test_calibration_gap_by_hand():
+    bins = [ReliabilityBin(0.9, 0.7, 30), ReliabilityBin(0.1, 0.2, 10)]
+    assert calibration_gap(bins) == pytest.approx((30 * 0.2 + 10 * 0.1) / 40)
+    assert calibration_gap([]) == 0.0

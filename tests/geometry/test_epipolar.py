@@ -92,3 +92,24 @@ def test_translation_error_ignores_the_sign() -> None:
     assert epipolar.translation_error_deg([1, 0, 0], [-1, 0, 0]) == pytest.approx(0.0)
     assert epipolar.translation_error_deg([1, 0, 0], [0, 2, 0]) == pytest.approx(90.0)
     assert epipolar.translation_error_deg([0, 0, 0], [0, 2, 0]) == 90.0
+
+
+def test_sampson_distance_through_a_lens_is_that_of_the_distorted_images():
+    """Linear lenses: the epipolar geometry of what was seen is x2' = A2 x2, and a true Sampson distance of its own."""
+    rng = np.random.default_rng(0)
+    correspondences, E = rng.normal(size=(40, 4)), rng.normal(size=(3, 3))
+    stretch1, stretch2 = rng.normal(size=(2, 2)), rng.normal(size=(2, 2))
+    seen = np.hstack(
+        [
+            np.linalg.solve(stretch1, correspondences[:, :2].T).T,
+            np.linalg.solve(stretch2, correspondences[:, 2:].T).T,
+        ]
+    )
+    A1, A2 = np.eye(3), np.eye(3)
+    A1[:2, :2], A2[:2, :2] = stretch1, stretch2
+    expected = epipolar.sampson_distance(seen, A2.T @ E @ A1)
+    many1, many2 = (np.tile(stretch, (40, 1, 1)) for stretch in (stretch1, stretch2))
+    np.testing.assert_allclose(epipolar.sampson_distance(correspondences, E, many1, many2), expected)
+    identity = np.tile(np.eye(2), (40, 1, 1))
+    plain = epipolar.sampson_distance(correspondences, E)
+    np.testing.assert_allclose(epipolar.sampson_distance(correspondences, E, identity, None), plain)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 
+import fisheye_views
 import multi_view
 import numpy as np
 import pytest
@@ -84,6 +85,12 @@ def test_everything_else_is_copied(few_pairs, tmp_path):
             assert before.execute(query).fetchall() == after.execute(query).fetchall()
 
 
+def test_a_report_lies_beside_the_output(few_pairs, tmp_path):
+    assert cli.main(["colmap", str(few_pairs), "-o", str(tmp_path / "out.db"), "--html", str(tmp_path / "r.html")]) == 0
+    assert "view01.png" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert len(read_geometries(tmp_path / "out.db")) == 2
+
+
 def test_in_place_equals_a_copy(few_pairs, tmp_path):
     database = few_pairs
     assert cli.main(["colmap", str(database), "-o", str(tmp_path / "out.db"), "-q"]) == 0
@@ -116,6 +123,42 @@ def test_distorted_keypoints_come_back_to_the_pinhole(model):
     pinhole = rays[:, :2] * K[[0, 1], [0, 1]] + K[:2, 2]
     assert np.abs(distorted - pinhole).max() > 1.0
     np.testing.assert_allclose(colmap.undistorted(camera, distorted), pinhole - 0.5, atol=1e-3)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_stretch_is_the_derivative_of_undistorting(model):
+    camera = pycolmap.Camera(model=model, width=640, height=480, params=MODELS[model])
+    rng = np.random.default_rng(0)
+    points, step = rng.uniform((150, 100), (500, 380), (50, 2)), 0.1 * rng.normal(size=(50, 2))
+    stretch = colmap.stretch(camera, points)
+    moved = colmap.undistorted(camera, points + step) - colmap.undistorted(camera, points)
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", stretch, step), moved, atol=2e-3)
+    assert np.abs(stretch - np.eye(2)).max() > 1e-3
+
+
+def test_a_pinhole_has_no_stretch():
+    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[512, 515, 320, 240])
+    assert colmap.stretch(camera, np.zeros((3, 2))) is None
+
+
+def test_a_fisheye_keeps_its_rim(tmp_path):
+    path = tmp_path / "fisheye.db"
+    lens = [fisheye_views.LENS.k1, fisheye_views.LENS.k2, fisheye_views.LENS.k3, fisheye_views.LENS.k4]
+    with closing(pycolmap.Database.open(path)) as opened:
+        params = [300, 300, 512, 512, *lens]
+        camera = pycolmap.Camera(model="OPENCV_FISHEYE", width=1024, height=1024, params=params)
+        camera.has_prior_focal_length = True
+        camera_id = opened.write_camera(camera)
+        ids = [opened.write_image(pycolmap.Image(name=name, camera_id=camera_id)) for name in ("a.png", "b.png")]
+        for image_id, points in zip(ids, (fisheye_views.P, fisheye_views.Q)):
+            opened.write_keypoints(image_id, (points + 0.5).astype(np.float32))
+        rows = np.arange(len(fisheye_views.P), dtype=np.uint32)
+        opened.write_matches(*ids, np.stack([rows, rows], axis=1))
+    assert cli.main(["colmap", str(path), "--in-place", "-q"]) == 0
+    (geometry,) = read_geometries(path).values()
+    mask = np.isin(np.arange(len(fisheye_views.P)), geometry.inlier_matches[:, 0])
+    assert min(fisheye_views.recalls(mask)) > 0.97
+    assert mask[~fisheye_views.RIGHT].mean() < 0.05
 
 
 def test_pairs_of_a_distorted_camera_are_found(tmp_path, views, raw_matches):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import resource
@@ -14,10 +15,12 @@ import h5py
 import numpy as np
 import pytest
 from conftest import METADATA, build_model
+from exif_files import FOCAL_35MM, with_exif
 from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.geometry.epipolar import pose_error_deg
+from mgca_filter.html_report import write_folder_report
 from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
 
 OPTIONS = ["--K", K_WORDS, "-q"]
@@ -50,10 +53,26 @@ def test_rows_equal_match_images(image_folder, views, expected):
         view1, view2 = (next(v for v in views if v.name == row[key]) for key in ("image1", "image2"))
         alone = match_images(view1.image, view2.image, K1=view1.K)
         assert row["status"] == alone.result.status.value
+        assert row["confidence"] == alone.result.confidence
         assert row["num_inliers"] == alone.result.num_inliers == len(row["points1"]) == len(row["scores"])
         np.testing.assert_allclose(row["R"], alone.result.R, atol=1e-9)
         R = view2.R @ view1.R.T
         assert pose_error_deg(row["R"], row["t"], R, view2.t - R @ view1.t) < 2.0
+
+
+def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
+    factor = 2.5
+    large = [cv2.resize(view.image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) for view in views[:2]]
+    (tmp_path / "images").mkdir()
+    for view, image in zip(views, large):
+        cv2.imwrite(str(tmp_path / "images" / view.name), image)
+    fx, fy, cx, cy = (views[0].K[[0, 1, 0, 1], [0, 1, 2, 2]] * factor).tolist()
+    K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    words = ["--K", f"{fx},{fy},{cx},{cy}", "-q"]
+    assert cli.main(["folder", str(tmp_path / "images"), "-o", str(tmp_path / "out.jsonl"), *words]) == 0
+    (row,) = read_rows(tmp_path / "out.jsonl")
+    alone, strict = (match_images(*large, K1=K, **options) for options in ({}, {"resolution": 1.0}))
+    assert row["num_inliers"] == alone.result.num_inliers > strict.result.num_inliers
 
 
 def test_processes_give_the_same_rows(image_folder, tmp_path, expected):
@@ -296,18 +315,64 @@ def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
     assert max(model.num_reg_images() for model in models.values()) == 4
 
 
-def test_intrinsics_of_another_size_are_told(image_folder, tmp_path, capsys):
-    """The rows are those of the matches; what is odd about the camera is a line, unless the user wants quiet."""
-    (image_folder / "view03.png").write_bytes(b"")
+def test_images_of_another_size_are_named_and_matched_without_K(image_folder, tmp_path, capsys):
     image = cv2.imread(str(image_folder / "view00.png"))
     cv2.imwrite(str(image_folder / "view00.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
-    few = [str(image_folder), "--K", K_WORDS, "--max-keypoints", "300"]
+    few = [str(image_folder), "--K", K_WORDS, "--max-keypoints", "500"]
     cli.main(["folder", *few, "-o", str(tmp_path / "a.jsonl")])
-    assert "mgca-match: one K for images of 2 sizes (480 x 640, 640 x 480)" in capsys.readouterr().err
+    told = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mgca-match:")]
+    assert told == ["mgca-match: one K is that of one size, here 640 x 480: matched without it: view00.png (480 x 640)"]
+    rows = read_rows(tmp_path / "a.jsonl")
+    assert {row["calibrated"] for row in rows if "view00.png" in (row["image1"], row["image2"])} == {False}
+    assert {row["calibrated"] for row in rows if "view00.png" not in (row["image1"], row["image2"])} == {True}
     cli.main(["folder", *few, "-q", "-o", str(tmp_path / "b.jsonl")])
     assert "one K" not in capsys.readouterr().err
     cli.main(["folder", str(image_folder), "--max-keypoints", "300", "-o", str(tmp_path / "c.jsonl")])
     assert "one K" not in capsys.readouterr().err
+
+
+def test_cameras_of_the_database_are_those_that_the_images_were_matched_with(image_folder, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    cv2.imwrite(str(image_folder / "view00.png"), np.zeros((640, 480), np.uint8))
+    assert run(image_folder, tmp_path / "out.db", "--max-keypoints", 300) == 0
+    with contextlib.closing(pycolmap.Database.open(tmp_path / "out.db")) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        of = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+    assert len(cameras) == 2
+    assert not of["view00.png"].has_prior_focal_length
+    assert of["view01.png"].has_prior_focal_length
+    np.testing.assert_allclose(of["view02.png"].params, [512, 512, 320, 240])
+
+
+@pytest.fixture
+def photographs(tmp_path, views):
+    """Two views as JPEG whose EXIF knows a focal length, 512 px, and one whose EXIF does not."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for number, view in enumerate(views[:3]):
+        jpeg = cv2.imencode(".jpg", view.image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+        (folder / f"{number}.jpg").write_bytes(with_exif(jpeg, {FOCAL_35MM: 28} if number < 2 else {}))
+    return folder
+
+
+def test_the_focal_length_is_that_of_the_exif_data(photographs, tmp_path):
+    words = ["folder", str(photographs), "-q", "-o"]
+    assert cli.main([*words, str(tmp_path / "out.jsonl")]) == 0
+    calibrated = {(row["image1"], row["image2"]): row["calibrated"] for row in read_rows(tmp_path / "out.jsonl")}
+    assert calibrated == {("0.jpg", "1.jpg"): True, ("0.jpg", "2.jpg"): False, ("1.jpg", "2.jpg"): False}
+    assert cli.main([*words, str(tmp_path / "guess.jsonl"), "--no-exif"]) == 0
+    assert not any(row["calibrated"] for row in read_rows(tmp_path / "guess.jsonl"))
+
+
+def test_cameras_of_the_exif_data_have_a_prior_focal_length(photographs, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    assert cli.main(["folder", str(photographs), "-q", "-o", str(tmp_path / "out.db")]) == 0
+    with contextlib.closing(pycolmap.Database.open(tmp_path / "out.db")) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        of = {image.name: cameras[image.camera_id] for image in database.read_all_images()}
+    assert [of[f"{number}.jpg"].has_prior_focal_length for number in range(3)] == [True, True, False]
+    assert len(cameras) == 2
+    np.testing.assert_allclose(of["0.jpg"].params, [512, 320, 240, 0])
 
 
 def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path, expected):
@@ -317,3 +382,35 @@ def test_the_filter_options_are_those_of_the_pair_command(image_folder, tmp_path
     assert 0 < sure["num_inliers"] != first["num_inliers"]
     assert run(image_folder, tmp_path / "cpu.jsonl", *few, "--providers", "CPUExecutionProvider") == 0
     assert read_rows(tmp_path / "cpu.jsonl")[0] == first
+
+
+def test_the_report_is_about_the_rows(image_folder, tmp_path, monkeypatch):
+    from mgca_filter.pipelines import run as run_module
+
+    written = []
+
+    def write_and_note(path, lines, **words):
+        lines = list(lines)
+        written.append((lines, words))
+        return write_folder_report(path, lines, **words)
+
+    monkeypatch.setattr(run_module, "write_folder_report", write_and_note)
+    (image_folder / "broken.jpg").write_bytes(b"no image")
+    output, page = tmp_path / "out.jsonl", tmp_path / "report.html"
+    assert run(image_folder, output, "--html", page) == 0
+    ((lines, words),) = written
+    keys = ("image1", "image2", "status", "num_matches", "num_inliers", "confidence")
+    assert [tuple(line) for line in lines] == [tuple(row[key] for key in keys) for row in read_rows(output)]
+    assert {line.status for line in lines} >= {"ok", "failed"}
+    assert words["title"] == "images"
+    assert words["command"].startswith("mgca-match folder ")
+    assert page.read_text(encoding="utf-8").startswith("<!")
+    assert not list(tmp_path.glob("*.partial"))
+
+
+def test_a_report_that_cannot_be_written_is_told_before_the_work(image_folder, tmp_path, capsys):
+    output = tmp_path / "out.jsonl"
+    for page, words in ((tmp_path, "is a folder"), (tmp_path / "no" / "r.html", "does not exist"), (output, "output")):
+        assert run(image_folder, output, "--html", page) == 2
+        assert_one_line(capsys.readouterr(), str(page), words)
+    assert not (tmp_path / "out.jsonl.work").exists()

@@ -30,6 +30,7 @@ def row(name1: str, name2: str, kept: int = 5, status: str = "ok", seed: int = 0
         rng.random(kept, dtype=np.float32),
         kept > 0,
         **(matrices if kept else {}),
+        confidence=float(rng.random()) if kept else None,
         message=message,
     )
 

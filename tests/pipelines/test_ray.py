@@ -9,9 +9,10 @@ import pytest
 from pipeline_command import K_WORDS
 
 from mgca_filter import cli
+from mgca_filter.features import ImageFeatures
 from mgca_filter.pipelines.journal import PipelineError
 from mgca_filter.pipelines.run import Workers
-from mgca_filter.pipelines.worker import ImageFeatures, PairWorker
+from mgca_filter.pipelines.worker import PairWorker
 
 ray = pytest.importorskip("ray")
 
