@@ -112,6 +112,12 @@ mgca::Options read_options(const Json& values) {
                              : method == "ransac" ? mgca::Method::ransac
                              : method == "none"   ? mgca::Method::none
                                                   : mgca::Method::automatic;
+        } else if (name == "geometry") {
+            const std::string& geometry = value.text();
+            options.geometry = geometry == "essential"     ? mgca::Geometry::essential
+                               : geometry == "fundamental" ? mgca::Geometry::fundamental
+                               : geometry == "homography"  ? mgca::Geometry::homography
+                                                           : mgca::Geometry::automatic;
         } else if (name == "threshold") {
             options.threshold = value.number();
         } else if (name == "confidence") {
@@ -145,6 +151,11 @@ mgca::MatchPair read_input(const std::filesystem::path& folder, const std::strin
     pair.camera1 = read_camera(input, "1");
     pair.camera2 = read_camera(input, "2");
     pair.attributes = read_attributes(input["attributes"]);
+    pair.resolution = input["resolution"].number();
+    if (input.has("fisheye1")) {
+        const std::vector<double> k = input["fisheye1"].numbers();
+        pair.camera1.fisheye = mgca::Fisheye{k[0], k[1], k[2], k[3]};
+    }
     return pair;
 }
 

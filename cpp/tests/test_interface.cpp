@@ -112,6 +112,10 @@ void inputs_are_checked(const Model& model, const MatchPair& good) {
     with([](MatchPair& p) { p.camera2.distortion = std::vector<double>(5, NAN); }, "camera2.distortion");
     with([](MatchPair& p) { p.camera1 = Camera(cv::Size2d(640, 480)); p.camera1.distortion = {0, 0, 0, 0}; },
          "distortion coefficients need K");
+    with([](MatchPair& p) { p.camera1.fisheye = mgca::Fisheye{NAN, 0, 0, 0}; }, "camera1.fisheye");
+    with([](MatchPair& p) { p.camera1.fisheye = mgca::Fisheye{}; p.camera1.distortion = {0, 0, 0, 0}; },
+         "a fisheye has coefficients of its own");
+    with([](MatchPair& p) { p.resolution = 0.0; }, "resolution");
     with([](MatchPair& p) { p.camera1.size = {0.5, 480.0}; }, "camera1.size");
     with([](MatchPair& p) { p.camera1.size = {640, 480}; p.camera2 = Camera(cv::Size2d(480, 640)); },
          "one K cannot be right");
@@ -177,6 +181,8 @@ void options_are_felt(const Model& model, const MatchPair& pair) {
     check::that(!same(magsac, alone([](Options& o) { o.seed = 11; })), "seed is felt");
     check::that(!same(magsac, alone([](Options& o) { o.confidence = 1e-6; })), "confidence is felt");
     check::that(answer([](Options& o) { o.method = mgca::Method::none; }).R.has_value() == false, "method is felt");
+    const Result plane = answer([](Options& o) { o.geometry = mgca::Geometry::homography; });
+    check::that(!plane.R && !plane.E && plane.mask != plain.mask, "geometry is felt");
     check::equal(answer([](Options& o) { o.method = mgca::Method::magsac; }).origin, std::string("magsac"), "method");
 }
 
@@ -192,6 +198,24 @@ void cameras_are_felt(const Model& model, const MatchPair& pair) {
     const Result distorted = filter(pair.keypoints1, pair.keypoints2, pair.matches, bent);
     check::that(straight.mask != distorted.mask, "distortion is felt");
     check::that(same(straight, filter(pair)), "one camera is both");
+    Camera fisheye = pair.camera1;
+    fisheye.fisheye = mgca::Fisheye{};
+    check::that(straight.mask != filter(pair.keypoints1, pair.keypoints2, pair.matches, fisheye).mask,
+                "a fisheye is felt");
+    Camera impossible = pair.camera1;
+    impossible.distortion = {-1.5, 0.2, 0.0, 0.0};
+    const Result doubtful = filter(pair.keypoints1, pair.keypoints2, pair.matches, impossible);
+    check::that(doubtful.assumptions.size() == 3 &&
+                    doubtful.assumptions[1].find("dist1 shows nothing at") == 0 &&
+                    doubtful.assumptions[1].find("Fisheye(k1, k2, k3, k4)") != std::string::npos,
+                "a lens that shows nothing is doubted");
+    MatchPair copy = pair;
+    copy.resolution = 3.0;
+    check::that(straight.num_inliers < filter(copy).num_inliers, "the resolution is felt");
+    Options essential;
+    essential.geometry = mgca::Geometry::essential;
+    check::throws<ArgumentError>(
+        [&] { Filter(model, essential)(pair.keypoints1, pair.keypoints2, pair.matches); }, "needs the intrinsics");
 }
 
 void threads_share_a_filter(const Model& model, const MatchPair& pair) {

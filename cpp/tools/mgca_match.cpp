@@ -37,6 +37,7 @@ constexpr const char* kHelp =
     "  --keep-precision P      mask of this expected precision instead of a threshold\n"
     "  --method NAME           auto, prosac, magsac, ransac or none\n"
     "  --effort NAME           auto or full\n"
+    "  --geometry NAME         auto, essential, fundamental or homography\n"
     "  --max-iterations N, --confidence P, --seed N\n"
     "  --max-keypoints N       default 2000\n"
     "  --threads N             of the network (default 1, 0 = all cores)\n"
@@ -103,6 +104,7 @@ Value word(const std::string& text, const std::string& option, const std::map<st
 
 void set_option(Arguments& arguments, const std::string& name, const std::string& value) {
     using mgca::Effort;
+    using mgca::Geometry;
     using mgca::Method;
     if (name == "--model") {
         arguments.model = value;
@@ -138,6 +140,12 @@ void set_option(Arguments& arguments, const std::string& name, const std::string
     } else if (name == "--effort") {
         arguments.options.effort =
             word<Effort>(value, name, {{"auto", Effort::automatic}, {"full", Effort::full}});
+    } else if (name == "--geometry") {
+        arguments.options.geometry = word<Geometry>(value, name,
+                                                    {{"auto", Geometry::automatic},
+                                                     {"essential", Geometry::essential},
+                                                     {"fundamental", Geometry::fundamental},
+                                                     {"homography", Geometry::homography}});
     } else {
         throw std::invalid_argument(name + ": unknown");
     }

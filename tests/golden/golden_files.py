@@ -33,7 +33,8 @@ class GoldenInput:
         keypoints1, keypoints2: rows (x, y, size, angle) of ``cv2.KeyPoint``, or (x, y) of bare points; null = NaN.
         matches: rows (query, train), (query, train, distance) or (…, second distance), or empty; None = row i matches
             row i.
-        K1, K2, dist1, dist2, size1, size2, attributes: as the arguments of the filter.
+        K1, K2, dist1, dist2, size1, size2, attributes, resolution: as the arguments of the filter.
+        fisheye1: coefficients of a fisheye, in the place of dist1.
     """
 
     name: str
@@ -47,6 +48,8 @@ class GoldenInput:
     size1: list[float] | None = None
     size2: list[float] | None = None
     attributes: dict[str, list[Any]] | None = None
+    fisheye1: list[float] | None = None
+    resolution: float = 1.0
 
     @classmethod
     def read(cls, path: Path) -> GoldenInput:
@@ -61,8 +64,13 @@ class GoldenInput:
                 **{name: np.array(v, dtype=kinds.get(name, np.float32)) for name, v in self.attributes.items()}
             )
         cameras = {name: getattr(self, name) for name in ("K1", "K2", "dist1", "dist2", "size1", "size2")}
-        arrays = {name: None if value is None else np.array(value, float) for name, value in cameras.items()}
+        arrays: dict[str, Any] = {
+            name: None if value is None else np.array(value, float) for name, value in cameras.items()
+        }
+        if self.fisheye1 is not None:
+            arrays["dist1"] = mgca_filter.Fisheye(*self.fisheye1)
         return {
+            "resolution": self.resolution,
             "kp1": _keypoints(self.keypoints1),
             "kp2": _keypoints(self.keypoints2),
             "matches": _matches(self.matches),
@@ -150,7 +158,7 @@ def describe(result: FilterResult) -> dict[str, Any]:
         "F": numbers(result.F),
         "R": numbers(result.R),
         "t": numbers(result.t),
-        "H": numbers(getattr(result, "H", None) if hasattr(result, "H") else result.info.get("homography")),
+        "H": numbers(result.H),
         "origin": result.info["origin"],
         "ended": result.info["ended"],
         "num_network_matches": result.info["num_network_matches"],

@@ -34,7 +34,8 @@ ROOT = HERE.parent.parent
 K2 = np.array([[700.0, 0.0, 310.0], [0.0, 710.0, 250.0], [0.0, 0.0, 1.0]])
 WRONG = np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]])
 # Numbers of right matches among 300 wrong ones from which the filter begins to believe.
-FAINT = (10, 13, 16)
+FAINT = (6, 13, 16)
+FISHEYE = [-0.02, 0.004, -0.001, 0.0002]
 WIDE_LENS = [-0.28, 0.09, 0.0008, -0.0005, -0.01]
 
 
@@ -76,6 +77,12 @@ def distorted(points: np.ndarray, camera: np.ndarray, coefficients: Sequence[flo
     return pixels[:, 0]
 
 
+def through_fisheye(points: np.ndarray, coefficients: Sequence[float]) -> np.ndarray:
+    """Pixels (N, 2) under ``K`` as a fisheye shows them."""
+    rays = ((points - K[:2, 2]) / K[0, 0])[:, None]
+    return cv2.fisheye.distortPoints(rays, K, np.array(coefficients))[:, 0]
+
+
 def change(golden: GoldenInput, name: str, **fields: Any) -> GoldenInput:
     return replace(golden, name=name, **fields)
 
@@ -90,6 +97,9 @@ def synthetic_inputs() -> list[GoldenInput]:
         general,
         points1=distorted(general.points1, K, WIDE_LENS),
         points2=distorted(general.points2, K, WIDE_LENS),
+    )
+    seen_by_fisheye = replace(
+        general, points1=through_fisheye(general.points1, FISHEYE), points2=through_fisheye(general.points2, FISHEYE)
     )
     planar, rotation = make_scene("planar", 150, 60, seed=1), make_scene("rotation", 150, 60, seed=1)
     unrelated = make_scene("general", 0, 300, seed=2)
@@ -107,6 +117,8 @@ def synthetic_inputs() -> list[GoldenInput]:
         from_scene("wide", wide, **camera),
         from_scene("two_cameras", seen_by_two, K1=K.tolist(), K2=K2.tolist()),
         from_scene("distortion", lens, **camera, dist1=WIDE_LENS),
+        from_scene("fisheye", seen_by_fisheye, **camera, fisheye1=FISHEYE),
+        from_scene("smaller_copy", general, **camera, resolution=2.0),
         from_scene("planar", planar, **camera),
         from_scene("planar_guessed", planar, size1=list(SIZE), size2=list(SIZE)),
         from_scene("rotation", rotation, **camera),
@@ -197,11 +209,16 @@ def cases(inputs: Sequence[GoldenInput]) -> list[Case]:
         "threshold": {"threshold": 0.4},
         "confidence": {"confidence": 0.5},
         "iterations": {"max_iterations": 30},
+        "essential": {"geometry": "essential"},
+        "fundamental": {"geometry": "fundamental"},
     }
     listed = [Case(golden.name, golden.name, {}) for golden in inputs]
     listed += [Case(f"wide_{name}", "wide", options) for name, options in wide.items()]
     return [
         *listed,
+        Case("planar_homography", "planar", {"geometry": "homography"}),
+        Case("unrelated_homography", "unrelated", {"geometry": "homography"}),
+        Case("guessed_fundamental", "guessed_by_size", {"geometry": "fundamental"}),
         Case("general_full", "general", {"effort": "full"}),
         Case("general_threshold", "general", {"threshold": 0.4}),
         Case("guessed_magsac", "guessed_by_size", {"method": "magsac"}),
