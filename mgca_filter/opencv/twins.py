@@ -420,6 +420,7 @@ def _fit_essential(
     E = result.E if result.E is not None else result.info["fitted_essential"]
     if E is None:
         E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
+        E = None if E is None else project_to_essential(E)  # OpenCV's own is one to a few digits only
     return E, _as_opencv_mask(result.mask, mask)
 
 
