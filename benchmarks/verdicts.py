@@ -30,6 +30,7 @@ from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
 from mgca_filter.features import FEATURE_SETTINGS, match_features
 from mgca_filter.geometry.epipolar import decompose_essential, pose_error_deg
 from mgca_filter.inputs.attributes import MatchAttributes
+from mgca_filter.inputs.options import FilterOptions
 from mgca_filter.inputs.pair import MatchPair
 from mgca_filter.match_filter import MatchFilter, model_path
 from mgca_filter.result import Status
@@ -226,7 +227,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--pairs", type=int, default=1200, metavar="N", help="of photographs, drawn (default 1200)")
     parser.add_argument("--bundles", type=Path, metavar="PATH", help="scene bundles: pairs with known pose")
     parser.add_argument("--store", type=Path, required=True, metavar="DIR", help="keeps features, matches and answers")
-    parser.add_argument("--method", default="prosac")
+    parser.add_argument("--method", default=FilterOptions.method)
     parser.add_argument("--list", metavar="FILE", type=Path, help="write the false and the lost pairs here")
     return run_study(run, parser.parse_args(arguments))
 

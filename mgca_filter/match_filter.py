@@ -327,7 +327,7 @@ class _Job:
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:
-        """The network's own E (3, 3), where it was asked."""
+        """The network E (3, 3), where it was asked."""
         return None if self.output is None else self.output.essential
 
 

@@ -130,12 +130,29 @@ def test_nothing_but_unusable_coordinates(match_filter: MatchFilter, value: floa
 
 
 @pytest.mark.parametrize("intrinsics", INTRINSICS)
-@pytest.mark.parametrize("method", ["prosac", "magsac", "ransac"])
-def test_only_outliers(model_file: Path, method: str, intrinsics: Any) -> None:
-    scene = make_scene(right=0, wrong=300, seed=1)
-    result = filter_matches(scene.points1, scene.points2, None, K1=intrinsics, method=method, model=model_file)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("known", [True, False])
+def test_only_outliers(match_filter: MatchFilter, intrinsics: Any, seed: int, known: bool) -> None:
+    scene = make_scene(right=0, wrong=300, seed=seed)
+    attributes = scene.attributes if known else None
+    result = match_filter.filter(scene.points1, scene.points2, None, K1=intrinsics, attributes=attributes)
     assert_consistent(result, 300)
     assert_no_model(result)
+
+
+@pytest.mark.parametrize("intrinsics", INTRINSICS)
+@pytest.mark.parametrize("method", ["prosac", "magsac", "ransac"])
+def test_of_only_outliers_one_estimator_alone_makes_nothing_to_use(
+    model_file: Path, method: str, intrinsics: Any
+) -> None:
+    """What several would have disagreed on, one may call doubtful, and no more."""
+    for seed in range(3):
+        scene = make_scene(right=0, wrong=300, seed=seed)
+        result = filter_matches(scene.points1, scene.points2, None, K1=intrinsics, method=method, model=model_file)
+        assert_consistent(result, 300)
+        assert not result.ok
+        assert result.status in (Status.UNRELATED, Status.NO_GEOMETRY, Status.LOW_SUPPORT)
+        assert (result.confidence or 0.0) < 0.3
 
 
 def test_duplicated_matches_do_not_add_support(match_filter: MatchFilter) -> None:

@@ -57,9 +57,12 @@ def test_the_doors_take_the_same_arguments() -> None:
 
 
 def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:
-    result = run(scene, model_file)
+    result = run(scene, model_file, effort="full")
     assert result.status is Status.OK
     assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+    assert result.H is None
+    assert 0.9 < result.confidence <= 1.0
+    assert result.info["translation_sigma_deg"] < 1.0
     assert result.mask.dtype == bool
     assert result.mask.shape == result.scores.shape == (200,)
     assert result.scores.dtype == np.float32
@@ -75,7 +78,8 @@ def test_result_holds_what_it_promises(scene: Scene, model_file: Path) -> None:
     pixels = np.hstack([scene.points1, scene.points2])
     np.testing.assert_array_equal(result.mask, sampson_distance(pixels, result.F) < 1.0)
     assert len({result, run(scene, model_file)}) == 2  # compared by identity: arrays have no one answer
-    assert repr(result) == f"FilterResult(status='ok', {result.num_inliers} of 200 matches kept)"
+    kept = f"{result.num_inliers} of 200 matches kept, confidence {result.confidence:.2f}"
+    assert repr(result) == f"FilterResult(status='ok', {kept})"
     with pytest.raises(AttributeError):
         result.mask = result.mask  # type: ignore[misc]
 
@@ -109,10 +113,11 @@ def test_permuting_the_matches_permutes_the_answer(scene: Scene, model_file: Pat
         points2=scene.points2[order],
         attributes=scene.attributes.take(order),
     )
-    one, other = run(scene, model_file), run(shuffled, model_file)
-    np.testing.assert_allclose(one.scores[order], other.scores, atol=1e-6)
-    np.testing.assert_array_equal(one.mask[order], other.mask)
-    np.testing.assert_allclose(one.E, other.E, atol=1e-6)
+    for effort in ("auto", "full"):
+        one, other = run(scene, model_file, effort=effort), run(shuffled, model_file, effort=effort)
+        np.testing.assert_allclose(one.scores[order], other.scores, atol=1e-6)
+        np.testing.assert_array_equal(one.mask[order], other.mask)
+        np.testing.assert_array_equal(one.E, other.E)
 
 
 def test_swapping_the_images_inverts_the_pose(scene: Scene, model_file: Path) -> None:
@@ -124,8 +129,8 @@ def test_swapping_the_images_inverts_the_pose(scene: Scene, model_file: Path) ->
 def test_scaling_pixels_with_the_intrinsics_changes_nothing(scene: Scene, model_file: Path) -> None:
     doubled = replace(scene, points1=2 * scene.points1, points2=2 * scene.points2)
     K2x = np.diag([2.0, 2.0, 1.0]) @ K
-    one = run(scene, model_file, threshold=0.5)
-    other = run(doubled, model_file, K1=K2x, threshold=1.0)
+    one = run(scene, model_file, threshold=0.5, effort="full")
+    other = run(doubled, model_file, K1=K2x, threshold=1.0, effort="full")
     assert pose_error_deg(other.R, other.t, one.R, one.t) < 0.5
     np.testing.assert_allclose(one.scores, other.scores, atol=1e-6)
 
@@ -145,7 +150,11 @@ def test_threshold_moves_the_mask_only(scene: Scene, model_file: Path) -> None:
     [
         {"method": "magsac"},
         {"method": "ransac"},
+        {"method": "prosac"},
         {"method": "none"},
+        {"geometry": "fundamental"},
+        {"geometry": "homography"},
+        {"max_iterations": 3},
         {"confidence": 0.01},
         {"seed": 1},
         {"K1": None},
@@ -258,7 +267,7 @@ def test_matches_that_are_no_candidates_score_by_the_prior_and_may_return(scene:
     hopeless = np.flatnonzero(scene.inlier)[:20]
     ratio[hopeless] = 0.99
     attributes = replace(scene.attributes, ratio=ratio)
-    result = run(scene, model_file, attributes=attributes)
+    result = run(scene, model_file, attributes=attributes, effort="full")
     assert result.info["num_network_matches"] == np.count_nonzero(ratio < 0.95)
     assert (result.scores[hopeless] < 0.5).all()
     assert (result.info["logits"][hopeless] < 0).all()
@@ -267,7 +276,7 @@ def test_matches_that_are_no_candidates_score_by_the_prior_and_may_return(scene:
 
 def test_calibration_of_the_model_file_is_applied(scene: Scene, tmp_path: Path) -> None:
     path = build_model(tmp_path / "m.onnx", {**METADATA, "calibration": '{"scale": 0.5, "offset": 1.0}'})
-    result = run(scene, path)
+    result = run(scene, path, effort="full")
     expected = 1 / (1 + np.exp(-(0.5 * result.info["logits"] + 1.0)))
     np.testing.assert_allclose(result.scores, expected, rtol=1e-5)
 
@@ -287,7 +296,7 @@ def test_the_networks_own_essential_matrix_may_be_the_answer(tmp_path: Path) -> 
 def test_many_matches_are_all_tested(model_file: Path, bare: bool) -> None:
     scene = make_scene(right=14000, wrong=6000)
     attributes = None if bare else replace(scene.attributes, best=None)
-    result = run(scene, model_file, attributes=attributes)
+    result = run(scene, model_file, attributes=attributes, effort="full")
     assert result.info["num_network_matches"] == MAX_NETWORK_MATCHES
     assert result.status is Status.OK
     assert result.mask[scene.inlier].mean() > 0.95
@@ -373,3 +382,128 @@ def test_sizes_help_the_guess(scene: Scene, model_file: Path) -> None:
     assert sized.info["assumptions"][0] == "focal length 768 px of image 1 guessed from the image size"
     extent = run(scene, model_file, K1=None)
     assert "extent of the keypoints" in extent.info["assumptions"][0]
+
+
+# --- Effort, geometry, limits -----------------------------------------------------------------------------------------
+
+EASY, HARD = make_scene(right=150, wrong=50), make_scene(right=60, wrong=240)
+
+
+@pytest.fixture
+def asked(match_filter: MatchFilter, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """How many matches each call sent to the network."""
+    backend, seen = match_filter._backend, []
+    infer = backend.infer
+    monkeypatch.setattr(backend, "infer", lambda *arrays: seen.append(arrays[0].shape[1]) or infer(*arrays))
+    return seen
+
+
+def ask(match_filter: MatchFilter, scene: Scene, **options: object) -> FilterResult:
+    chosen = MatchFilter.over(match_filter._backend, replace(match_filter.options, **options))
+    return chosen.filter(scene.points1, scene.points2, None, K1=K, attributes=scene.attributes)
+
+
+def test_an_easy_list_is_not_sent_to_the_network(match_filter: MatchFilter, asked: list[int]) -> None:
+    result = ask(match_filter, EASY)
+    assert asked == []
+    assert result.info["ended"] == "before the network"
+    assert result.info["num_network_matches"] == len(result.info["network_rows"]) == 0
+    assert result.info["network_essential"] is None
+    assert set(result.info["timings_ms"]) == {"prepare", "fit", "verdict", "total"}
+    assert result.status is Status.OK
+    assert pose_error_deg(result.R, result.t, EASY.R, EASY.t) < 1.0
+    # The scores separate, and say the same as the logits do through the calibration.
+    assert result.scores[EASY.inlier].min() > result.scores[~EASY.inlier].mean()
+    assert np.mean(result.scores[EASY.inlier] > 0.5) > 0.95
+    assert np.mean(result.scores[~EASY.inlier] > 0.5) < 0.1
+    calibrated = match_filter.metadata.calibration.probabilities(result.info["logits"])
+    np.testing.assert_allclose(calibrated, result.scores, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("scene", "options"),
+    [(HARD, {}), (EASY, {"effort": "full"}), (EASY, {"geometry": "fundamental"}), (EASY, {"geometry": "homography"})]
+    + [(EASY, {"method": method}) for method in ("prosac", "magsac", "ransac", "none")],
+    ids=str,
+)
+def test_every_other_list_is(match_filter: MatchFilter, asked: list[int], scene: Scene, options: dict) -> None:
+    result = ask(match_filter, scene, **options)
+    assert len(asked) == 1
+    assert result.info["ended"] != "before the network"
+    assert result.info["num_network_matches"] == len(result.info["network_rows"]) == asked[0]
+    assert "network" in result.info["timings_ms"]
+
+
+def test_without_intrinsics_every_list_is(match_filter: MatchFilter, asked: list[int]) -> None:
+    result = match_filter.filter(EASY.points1, EASY.points2, None, attributes=EASY.attributes)
+    assert len(asked) == 1
+    assert result.info["ended"] == "all sources"
+    assert result.confidence is None
+
+
+def test_in_a_batch_only_the_hard_ones_are(match_filter: MatchFilter, asked: list[int]) -> None:
+    pairs = [MatchPair(s.points1, s.points2, None, K1=K, attributes=s.attributes) for s in (EASY, HARD, EASY, HARD)]
+    results = match_filter.filter_many(pairs)
+    assert len(asked) == 1  # both in one batch
+    assert [r.info["ended"] == "before the network" for r in results] == [True, False, True, False]
+    assert_same(results[0], ask(match_filter, EASY))
+
+
+@pytest.mark.parametrize("scene", [EASY, HARD], ids=["easy", "hard"])
+def test_both_efforts_find_the_pose(match_filter: MatchFilter, scene: Scene) -> None:
+    results = [ask(match_filter, scene, effort=effort) for effort in ("auto", "full")]
+    for result in results:
+        assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+    assert (results[0].info["ended"] == results[1].info["ended"]) == (scene is HARD)
+
+
+def test_an_essential_matrix_needs_intrinsics(model_file: Path) -> None:
+    with pytest.raises(ValueError, match="K1: geometry='essential'"):
+        run(EASY, model_file, K1=None, geometry="essential")
+    assert_same(run(EASY, model_file, geometry="essential"), run(EASY, model_file))
+
+
+def test_a_fundamental_matrix_is_not_bound_to_the_intrinsics(model_file: Path) -> None:
+    """Under a wrong K it fits as well as without one, and a list that E contradicts is not suspicious to it."""
+    scene = make_scene("wide", right=200, wrong=40)
+    wrong_K = np.array([[2400.0, 0.0, 1279.5], [0.0, 800.0, 959.5], [0.0, 0.0, 1.0]])
+    assert run(scene, model_file, K1=wrong_K).status is Status.SUSPICIOUS_INTRINSICS
+    for given in (K, wrong_K):
+        result = run(scene, model_file, K1=given, geometry="fundamental")
+        assert result.status is Status.OK
+        assert result.confidence is None
+        assert result.info["intrinsics"] == "given"
+        pixels = np.hstack([scene.points1, scene.points2])
+        assert np.mean(sampson_distance(pixels[scene.inlier], result.F) < 1.0) > 0.95
+    values = np.linalg.svd(K.T @ run(scene, model_file, geometry="fundamental").F @ K, compute_uv=False)
+    assert values[0] / values[1] > 1.0001
+
+
+def test_a_homography_that_is_asked_for_comes_alone(model_file: Path) -> None:
+    plane = make_scene("planar", right=120, wrong=80)
+    result = run(plane, model_file, geometry="homography")
+    assert result.status is Status.OK
+    assert all(value is None for value in (result.E, result.F, result.R, result.t, result.confidence))
+    mapped = cv2.perspectiveTransform(plane.points1[None], result.H)[0]
+    assert np.median(np.linalg.norm(mapped - plane.points2, axis=1)[plane.inlier]) < 1.0
+    assert result.mask[plane.inlier].mean() > 0.9
+    assert result.mask[~plane.inlier].mean() < 0.05
+    np.testing.assert_array_equal(result.info["homography"], result.H)
+    lost = run(make_scene(right=0, wrong=200), model_file, geometry="homography")
+    assert lost.status in (Status.UNRELATED, Status.NO_GEOMETRY)
+    assert lost.H is None
+    assert not lost.mask.any()
+    few = filter_matches(plane.points1[:3], plane.points2[:3], None, geometry="homography", model=model_file)
+    assert few.status is Status.TOO_FEW_MATCHES
+
+
+def test_two_keypoints_and_more_of_one_match_are_one_witness(match_filter: MatchFilter) -> None:
+    repeated = np.repeat(np.arange(200), 4)
+    one = ask(match_filter, EASY)
+    kp1, kp2 = EASY.points1, EASY.points2
+    many = match_filter.filter(
+        kp1, kp2, np.stack([repeated] * 2, axis=1), K1=K, attributes=EASY.attributes.take(repeated)
+    )
+    np.testing.assert_array_equal(many.E, one.E)
+    assert many.confidence == one.confidence
+    np.testing.assert_array_equal(many.mask, np.repeat(one.mask, 4))

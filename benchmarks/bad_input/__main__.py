@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from mgca_filter import cli
+from mgca_filter.inputs.options import FilterOptions
 from mgca_filter.match_filter import MatchFilter, model_path
 from mgca_filter.opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
 from mgca_filter.tables import render_table
@@ -178,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bad_input", description=__doc__)
     parser.add_argument("--rounds", type=int, default=len(COUNTS), metavar="N", help="inputs of each kind and entry")
     parser.add_argument("--model", type=Path, default=model_path(), metavar="FILE")
-    parser.add_argument("--method", default="prosac")
+    parser.add_argument("--method", default=FilterOptions.method)
     parser.add_argument("--seed", type=int, default=0)
     return run_study(run, parser.parse_args(arguments))
 

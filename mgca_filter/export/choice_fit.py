@@ -45,11 +45,11 @@ FOLDS = 5
 KINDS = ("raw", "cross", "ratio", "cross and ratio")
 CROSS_RATIO, PLAIN_RATIO = 0.8, 0.75
 # "ok" is said from the confidence on at which this share is right, and nothing below the second, which is chance's.
-OK_PRECISION, LEAST_CONFIDENCE = 0.955, 0.15
+OK_PRECISION, LEAST_CONFIDENCE = 0.96, 0.1
 # Of the poses that the bundles of a scene vouch for, so many of the easy ones agree with them (``QUALITY.csv``).
 LEAST_QUALITY = 0.92
 PLAUSIBLE_FOCAL_FACTOR = 0.9
-_RIDGE, _NEWTON_STEPS = 1e-2, 30
+_RIDGE, _NEWTON_STEPS = 3e-3, 30
 # Pairs of different places are rarer here than anywhere else: each counts for so many.
 _UNRELATED_WEIGHT = 1.0
 
@@ -74,7 +74,7 @@ def kinds_of(pair: ScenePair) -> Iterator[tuple[str, ScenePair]]:
         if np.count_nonzero(kept) < 8:
             continue
         attributes = pair.attributes.take(kept)
-        if kind != "raw":  # whoever filters tells of no lost rivals
+        if kind != "raw":  # whoever filters tells of no lost alternatives
             attributes = replace(attributes, best=np.ones(np.count_nonzero(kept), dtype=bool))
         yield (
             kind,

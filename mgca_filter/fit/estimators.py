@@ -26,7 +26,10 @@ _PRESETS = {
     "prosac": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
     "magsac": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MAGSAC, cv2.LOCAL_OPTIM_SIGMA, 10, 14),
     "homography": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
+    "homography in order": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
 }
+# For F OpenCV's USAC_MAGSAC optimises on larger samples.
+_MAGSAC_FUNDAMENTAL_LO_SAMPLE = 50
 # PoseLib may take ten times as many before it gives up, which takes seconds.
 _POSELIB_MAX_ITERATIONS = 10_000
 # Bound at import: ``patch_cv2`` swaps the names in cv2, and the fit must not call the filter that it is part of.
@@ -90,6 +93,8 @@ def _fit_opencv(rows: Array, focal_px: float, options: EstimatorOptions, calibra
             M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
         else:
             params = usac_params(options.method, threshold, *limits, options.seed)
+            if not calibrated and options.method == "magsac":
+                params.loSampleSize = _MAGSAC_FUNDAMENTAL_LO_SAMPLE
             if calibrated:
                 # None, not zeros, for the distortion: a vector of coefficients crashes OpenCV 5.0 in this overload.
                 M, _ = _find_essential_mat(x1, x2, np.eye(3), np.eye(3), None, None, params)
@@ -135,7 +140,9 @@ def _fit_poselib(rows: Array, focal_px: float, options: EstimatorOptions, calibr
     # One camera of the mean focal length puts PoseLib's thresholds in the pixels that this package uses.
     points1, points2 = rows[:, :2] * focal_px, rows[:, 2:] * focal_px
     if not calibrated:
-        F, _ = poselib.estimate_fundamental(points1, points2, ransac, {})
+        F, information = poselib.estimate_fundamental(points1, points2, ransac, {})
+        if information.get("num_inliers", 0) == 0:  # then F is whatever lay in memory
+            return None
         return _best_of_stack(F, np.diag([focal_px, focal_px, 1.0]), rows, options.threshold_px / focal_px)
     camera = {"model": "SIMPLE_PINHOLE", "width": 0, "height": 0, "params": [focal_px, 0.0, 0.0]}
     pose, information = poselib.estimate_relative_pose(points1, points2, camera, camera, ransac, {})
@@ -153,17 +160,21 @@ def usac_params(preset: str, threshold: float, confidence: float, max_iterations
     return params
 
 
-def fit_homography(points1: Array, points2: Array, threshold: float, seed: int = 0) -> Array | None:
+def fit_homography(
+    points1: Array, points2: Array, threshold: float, seed: int = 0, ordered: bool = False
+) -> Array | None:
     """Homography (3, 3) with ``p2 ~ H p1`` of points (N, 2), scaled to H[2, 2] = 1, or None.
 
     Args:
         threshold: transfer error of an inlier, in the unit of the points. seed: of the sampling.
+        ordered: the most promising points come first, and are drawn first.
     """
     if len(points1) < 4:
         return None
     # OpenCV holds some constants in pixels: in units of the threshold, any coordinates look like pixels to it.
     scale = np.diag([1.0 / threshold, 1.0 / threshold, 1.0])
-    params = usac_params("homography", 1.0, _HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS, seed)
+    preset = "homography in order" if ordered else "homography"
+    params = usac_params(preset, 1.0, _HOMOGRAPHY_CONFIDENCE, _HOMOGRAPHY_ITERATIONS, seed)
     try:
         H, _ = _find_homography(points1 / threshold, points2 / threshold, params)
     except cv2.error:

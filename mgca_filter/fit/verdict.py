@@ -241,7 +241,7 @@ def _plane_or(
     """A plane that explains a pair whose pose is doubtful, more than chance would; else the verdict as it is."""
     rows = np.hstack(pair.pixels(evidence.rows))
     sharp = rows[evidence.accepted()]
-    quick = fit_homography(sharp[:, :2], sharp[:, 2:], _QUICK_PLANE_PX, options.seed)
+    quick = fit_homography(sharp[:, :2], sharp[:, 2:], _QUICK_PLANE_PX, options.seed, ordered=True)
     if quick is None or homography_false_alarms(sharp, quick, _PLANE_PX) > MEANINGFUL_LOG10_NFA:
         return verdict
     H = _best_homography(pair, evidence, options, quick)

@@ -304,10 +304,15 @@ class _Pair:
         """From the raw matches to the kept ones, times, and what was assumed."""
         result, info = self.result, self.result.info
         accepted = info.get("num_accepted")
+        asked = info.get("ended") != "before the network"
         funnel = [
             ("raw", len(result.mask), "putative matches that came in"),
-            ("candidates", info.get("num_network_matches"), "of them went through the network"),
-            ("accepted", accepted, "of those it takes for right"),
+            ("candidates", info.get("num_network_matches") if asked else None, "of them went through the network"),
+            (
+                "accepted",
+                accepted,
+                "of those it takes for right" if asked else "of them agree with what they explain alone",
+            ),
             (
                 "supporting",
                 None if accepted is None else info.get("support"),

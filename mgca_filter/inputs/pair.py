@@ -104,17 +104,6 @@ class PairInput:
         """Mean focal length in pixels."""
         return mean_focal_length(self.intrinsics1.K, self.intrinsics2.K)
 
-    def epipolar_distance_px(
-        self, rows: NDArray[np.intp] | NDArray[np.bool_], E: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Sampson distance (K,) of a selection of matches to E (3, 3), in pixels as they were found.
-
-        Through a lens the derivative of the lens counts: near the rim of a fisheye a pixel is a long way on the image
-        plane.
-        """
-        stretch1, stretch2 = (None if s is None else s[rows] for s in (self.stretch1, self.stretch2))
-        return sampson_distance(self.correspondences[rows], E, stretch1, stretch2) * self.focal_px
-
     def with_focal(self, factor: float) -> PairInput:
         """The pair under the guessed focal length times ``factor``, taken for the truth from now on."""
         zoom = np.diag([factor, factor, 1.0])
@@ -126,6 +115,17 @@ class PairInput:
         return replace(
             self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
         )
+
+    def epipolar_distance_px(
+        self, rows: NDArray[np.intp] | NDArray[np.bool_], E: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Sampson distance (K,) of a selection of matches to E (3, 3), in pixels as they were found.
+
+        Through a lens the derivative of the lens counts: near the rim of a fisheye a pixel is a long way on the image
+        plane.
+        """
+        stretch1, stretch2 = (None if s is None else s[rows] for s in (self.stretch1, self.stretch2))
+        return sampson_distance(self.correspondences[rows], E, stretch1, stretch2) * self.focal_px
 
     def threshold_px(self, threshold: float) -> float:
         """The caller's threshold in pixels of the image in which the keypoints were found."""

@@ -40,12 +40,13 @@ from numpy.typing import NDArray
 
 from ..fit.homography_fit import HomographyFit, HomographyOptions, estimate_homography
 from ..fit.planarity import MEANINGFUL_LOG10_NFA, homography_false_alarms
+from ..geometry.epipolar import essential_from_pose
 from ..geometry.homography import scaled_homography, transfer
 from ..inputs.keypoints import read_keypoints
 from ..inputs.options import FilterOptions, check_integer, check_number
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter, filter_matches
-from ..result import FilterResult
+from ..result import FilterResult, Status
 from .overloads import call_overload
 
 Array = NDArray[np.float64]
@@ -418,10 +419,22 @@ def _fit_essential(
     pair = MatchPair(points1, points2, None, K1, K2, _coefficients(dist1), _coefficients(dist2))
     result = _run(pair, options, "findEssentialMat")
     E = result.E if result.E is not None else result.info["fitted_essential"]
+    if result.status is Status.PURE_ROTATION and result.R is not None:
+        E = _essential_of_rotation(result.R)
     if E is None:
         E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
         E = None if E is None else project_to_essential(E)  # OpenCV's own is one to a few digits only
     return E, _as_opencv_mask(result.mask, mask)
+
+
+def _essential_of_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An essential matrix (3, 3) from which ``cv2.recoverPose`` takes this rotation.
+
+    Where the camera only turned, no depth tells the two rotations that E allows apart, and OpenCV takes the first of
+    its decomposition; which one that is hangs on the direction of translation, and any will do.
+    """
+    candidates = [essential_from_pose(R, t) for t in (*np.eye(3), *(1.0 - np.eye(3)), *-np.eye(3))]
+    return max(candidates, key=lambda E: float(np.vdot(cv2.decomposeEssentialMat(E)[0], R)))
 
 
 def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: Any) -> Answer:

@@ -16,7 +16,7 @@ def result_with(**changes: object) -> FilterResult:
     E = np.array([[0, 0, 0], [0, 0, -1], [0, 1, 0]]) / np.sqrt(2)
     fields = {
         "mask": np.ones(10, bool), "scores": np.full(10, 0.9, np.float32), "matches": [0] * 10, "E": E, "F": E,
-        "R": np.eye(3), "t": np.array([1.0, 0, 0]), "status": Status.OK, "num_inliers": 10, **changes,
+        "R": np.eye(3), "t": np.array([1.0, 0, 0]), "H": None, "status": Status.OK, "num_inliers": 10, **changes,
     }  # fmt: skip
     return FilterResult(**fields)
 

@@ -60,9 +60,7 @@ def test_hopeless_input_gives_no_pose():
 
 def test_table_has_one_aligned_row_each():
     scene = make_scene(right=3, wrong=0)
-    nothing = FilterResult(
-        np.zeros(3, bool), np.zeros(3, np.float32), [], None, None, None, None, Status.NO_GEOMETRY, 0
-    )
+    nothing = FilterResult(np.zeros(3, bool), np.zeros(3, np.float32), [], *[None] * 5, Status.NO_GEOMETRY, 0)
     solved = fits_of(make_scene(right=100, wrong=10))
     lines = comparison_table(nothing, 12.0, [*fits_of(scene), *solved]).splitlines()
     assert len(lines) == 1 + 1 + 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import subprocess
 import sys
@@ -13,6 +14,8 @@ import pytest
 from pipeline_command import ROOT, assert_one_line, start_command
 
 from mgca_filter import cli
+from mgca_filter.cli.arguments import add_filter_options, filter_options
+from mgca_filter.inputs.options import FilterOptions
 
 IMAGES = ROOT / "examples" / "images"
 LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
@@ -119,3 +122,12 @@ def test_sixteen_bit_files_keep_their_matches(
     assert cli.main([*paths, *K_WORDS]) == 0
     kept = int(capsys.readouterr().out.splitlines()[2].split(" matches in, ")[1].split(" kept")[0])
     assert kept > 190  # of the picture in 8 bits: 211
+
+
+def test_the_command_line_has_the_defaults_of_the_library() -> None:
+    parser = argparse.ArgumentParser()
+    add_filter_options(parser)
+    given = filter_options(parser.parse_args([]))
+    defaults = FilterOptions()
+    for name in ("threshold", "keep_precision", "method", "seed"):
+        assert given[name] == getattr(defaults, name), name

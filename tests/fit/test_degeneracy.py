@@ -81,9 +81,23 @@ def test_only_wrong_matches_have_no_model(match_filter: MatchFilter, seed: int, 
 
 
 def test_weak_support_is_named(match_filter: MatchFilter) -> None:
-    statuses = [run(match_filter, make_scene(right=12, wrong=10, seed=seed)).status for seed in range(5)]
+    """Twelve right matches among sixty wrong ones: mostly the pose is right, and nothing vouches for it."""
+    results = [run(match_filter, make_scene(right=12, wrong=60, seed=seed)) for seed in range(5)]
+    statuses = [result.status for result in results]
     assert Status.LOW_SUPPORT in statuses
     assert Status.OK not in statuses
+    assert all(result.confidence is None or result.confidence <= 0.5 for result in results)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_few_right_matches_are_ok_where_the_pose_is_right(match_filter: MatchFilter, seed: int) -> None:
+    """Twelve of twenty-two: far more than chance, and near the truth."""
+    scene = make_scene(right=12, wrong=10, seed=seed)
+    result = run(match_filter, scene)
+    assert result.status is Status.OK
+    assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 5.0
+    assert result.confidence < 0.97
+    assert result.mask[scene.inlier].mean() > 0.8
 
 
 @pytest.mark.parametrize("seed", range(3))

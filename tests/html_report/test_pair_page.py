@@ -23,7 +23,7 @@ NAME = "<img src=x onerror='document.title=1'>.jpg"
 
 @pytest.fixture(scope="module")
 def result(model_file) -> FilterResult:
-    return MatchFilter(model=model_file).filter(*SCENE.keypoints(), SCENE.knn_matches(), K1=K)
+    return MatchFilter(model=model_file, effort="full").filter(*SCENE.keypoints(), SCENE.knn_matches(), K1=K)
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ def noise(width: int, height: int, seed: int = 0) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def result(model_file) -> FilterResult:
-    return MatchFilter(model=model_file).filter(*SCENE.keypoints(), SCENE.knn_matches(), K1=K)
+    return MatchFilter(model=model_file, effort="full").filter(*SCENE.keypoints(), SCENE.knn_matches(), K1=K)
 
 
 @pytest.fixture
@@ -76,7 +76,9 @@ def many_matches(count: int, kept: int) -> FilterResult:
     points = rng.uniform(0, 480, (2, count, 2))
     scores = rng.uniform(0, 1, count).astype(np.float32)
     F = np.random.default_rng(1).normal(size=(3, 3))
-    return FilterResult(mask, scores, np.zeros((kept, 2), np.intp), None, F, None, None, Status.OK, kept, *points)
+    return FilterResult(
+        mask, scores, np.zeros((kept, 2), np.intp), None, F, None, None, None, Status.OK, kept, None, *points
+    )
 
 
 @pytest.mark.parametrize(("kept", "shown_kept"), [(500, 500), (25_000, MAX_MATCHES_SHOWN)])
@@ -163,6 +165,14 @@ def test_the_funnel_narrows_to_what_was_accepted(written, result):
     assert funnel["kept"] == result.num_inliers
 
 
+def test_the_funnel_of_a_pair_that_needed_no_network_has_no_step_for_it(written, model_file):
+    easy = MatchFilter(model=model_file).filter(*SCENE.keypoints(), SCENE.knn_matches(), K1=K)
+    assert easy.info["ended"] == "before the network"
+    funnel = {name: count for name, count, _ in written(easy)[1]["why"]["funnel"]}
+    assert list(funnel) == ["raw", "accepted", "supporting", "kept"]
+    assert funnel["raw"] >= funnel["accepted"] >= funnel["supporting"] > 0
+
+
 @pytest.mark.parametrize("option", ["name1", "name2", "command"])
 def test_words_of_the_caller_are_in_the_file(written, option):
     assert "a7c3f" in written(**{option: "a7c3f"})[0]
@@ -214,7 +224,10 @@ def test_a_result_shows_its_verdict_in_a_notebook(result):
     assert describe_verdict("ok").headline in text
     assert f"{result.num_inliers} of 120 matches" in text
     assert "<img" not in text
-    few = FilterResult(np.zeros(0, bool), np.zeros(0, np.float32), [], None, None, None, None, Status.UNRELATED, 0)
+    nothing = dict.fromkeys(("E", "F", "R", "t", "H"))
+    few = FilterResult(
+        np.zeros(0, bool), np.zeros(0, np.float32), [], **nothing, status=Status.UNRELATED, num_inliers=0
+    )
     assert "rotation" not in few._repr_html_()
 
 
@@ -240,10 +253,7 @@ def test_advice_depends_on_what_is_known():
 
 
 def test_confidence_of_a_result_reaches_the_report(written, result):
-    class Confident(FilterResult):
-        confidence = 0.42
-
-    sure = Confident(**{field.name: getattr(result, field.name) for field in dataclasses.fields(result)})
+    sure = dataclasses.replace(result, confidence=0.42)
     assert "only 42 %" in written(sure)[0]
     assert "42 %" in sure._repr_html_()
 

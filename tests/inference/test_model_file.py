@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from test_backends import random_input, write_safetensors
 
 import mgca_filter
 from mgca_filter import ModelError
+from mgca_filter.fit.choice import fitted_coefficients
 from mgca_filter.inference import METADATA_KEYS, OnnxBackend, open_backend
 from mgca_filter.inference.model_file import ModelFile
 
@@ -27,12 +29,19 @@ def test_missing_metadata_is_named(key: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("contract_version", "2"),
+        ("contract_version", "1"),
+        ("contract_version", "3"),
         ("calibration", "{}"),
         ("calibration", '{"scale": "nan", "offset": 0}'),
         ("decision_threshold", "high"),
         ("candidate_rule", "[]"),
         ("config", "no json"),
+        ("choice", "no json"),
+        ("choice", "[]"),
+        ("choice", "{}"),
+        ("choice", json.dumps({**fitted_coefficients(), "verdict": [0.1]})),
+        ("choice", json.dumps({**fitted_coefficients(), "confidence": ["high"] * 24})),
+        ("choice", json.dumps({**fitted_coefficients(), "noise_px": 3})),
         ("prior", '{"weight1": [[1]], "bias1": [0], "weight2": [1], "bias2": 0}'),
     ],
 )

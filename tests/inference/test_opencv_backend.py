@@ -132,8 +132,8 @@ def test_broken_files_are_named(model_file: Path, tmp_path: Path) -> None:
 
 
 def test_contract_is_checked_without_a_runtime(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="contract version 2"):
-        OpenCvBackend(build_model(tmp_path / "a.onnx", {**METADATA, "contract_version": "2"}))
+    with pytest.raises(ModelError, match="contract version 1"):
+        OpenCvBackend(build_model(tmp_path / "a.onnx", {**METADATA, "contract_version": "1"}))
     with pytest.raises(ModelError, match="inputs"):
         OpenCvBackend(build_model(tmp_path / "b.onnx", input_names=("points", "attributes")))
     with pytest.raises(ModelError, match="outputs"):

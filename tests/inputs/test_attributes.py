@@ -6,7 +6,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mgca_filter.fit.evidence import distinct_rows
 from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.inputs.attributes import MatchAttributes, candidate_mask
 
@@ -66,11 +65,3 @@ def test_selection_takes_every_known_field() -> None:
     assert taken.ratio is not None
     assert taken.ratio.tolist() == [np.float32(0.2)]
     assert taken.best is None
-
-
-@given(st.lists(st.tuples(*[st.sampled_from([-1.0, -0.0, 0.0, 0.5])] * 3), max_size=30))
-def test_distinct_rows_are_those_of_numpy(values: list[tuple[float, ...]]) -> None:
-    rows = np.array(values).reshape(-1, 3)
-    expected, first = np.unique(rows, axis=0, return_index=True)
-    np.testing.assert_array_equal(distinct_rows(rows), first)
-    np.testing.assert_array_equal(rows[distinct_rows(rows)], expected)

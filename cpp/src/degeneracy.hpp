@@ -1,0 +1,41 @@
+// Does the model deserve trust? Chance, lines and rotations, told apart by simple rules; mgca_filter/fit/degeneracy.py.
+
+#pragma once
+
+#include "epipolar.hpp"
+
+#include <vector>
+
+namespace mgca::detail {
+
+constexpr int kMinSupport = 13;
+// Number of false alarms, log10: above the first the support is chance, above the second it is weak.
+constexpr double kUnrelatedLog10Nfa = 0.5, kLowSupportLog10Nfa = -1.0;
+constexpr double kIntrinsicsSupportFactor = 1.5;
+
+/// How well the fitted matches stand behind the model.
+struct Support {
+    int count = 0;              // distinct matches within the threshold
+    double log10_nfa = 0.0;     // log10 of how many models chance would support as well
+    double chance_count = 0.0;  // about how many of `count` are wrong matches that agree by accident
+};
+
+/// Support of a model among the matches that it was fitted to, all normalised.
+Support measure_support(const Correspondences& matches, const cv::Matx33d& M, double threshold);
+
+/// Share of the wrong pairings of the same points that agree with the model.
+double chance_rate(const Correspondences& matches, const cv::Matx33d& M, double threshold);
+
+/// log10 of the number of models that chance would support by `inliers` of `count` matches.
+double log10_false_alarms(int count, int inliers, double rate);
+
+/// Distance of points to the line that fits most of them, points beyond the threshold set aside.
+std::vector<double> line_distances(const std::vector<cv::Point2d>& points, double threshold);
+
+/// Rotation that best aligns the viewing rays of normalised matches (Kabsch), outliers set aside.
+cv::Matx33d fit_rotation(const Correspondences& matches, double threshold);
+
+/// True where a degenerate model explains nearly all inliers, but for those that are there by accident.
+bool explains(const std::vector<double>& distances, double threshold, const Support& support);
+
+}  // namespace mgca::detail

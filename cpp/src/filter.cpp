@@ -1,0 +1,191 @@
+// The public door; the flow of one pair, one call per step, in order; mgca_filter/match_filter.py.
+
+#include "model_file.hpp"
+#include "network.hpp"
+#include "robust_fit.hpp"
+#include "scoring.hpp"
+#include "verdict.hpp"
+
+#include <mgca/filter.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+namespace mgca {
+
+struct Model::State {
+    detail::ModelMetadata metadata;
+    std::unique_ptr<detail::Network> network;
+};
+
+namespace {
+
+void check(const Options& options) {
+    const auto inside = [](double value) { return value > 0.0 && value < 1.0; };
+    if (!(options.threshold > 0.0) || !std::isfinite(options.threshold)) {
+        throw ArgumentError("threshold: expected a number above 0, got " + std::to_string(options.threshold));
+    }
+    if (options.keep_precision && !inside(*options.keep_precision)) {
+        throw ArgumentError("keep_precision: expected a number above 0 and below 1, got " +
+                            std::to_string(*options.keep_precision));
+    }
+    if (!inside(options.confidence)) {
+        throw ArgumentError("confidence: expected a number above 0 and below 1, got " +
+                            std::to_string(options.confidence));
+    }
+    if (options.max_iterations < 1) {
+        throw ArgumentError("max_iterations: expected 1 or more, got " + std::to_string(options.max_iterations));
+    }
+    if (options.seed < 0) {
+        throw ArgumentError("seed: expected 0 or more, got " + std::to_string(options.seed));
+    }
+}
+
+void check(const RuntimeOptions& options) {
+    if (options.threads < 0) {
+        throw ArgumentError("threads: expected 0 or more, got " + std::to_string(options.threads));
+    }
+}
+
+std::shared_ptr<const Model::State> open_model(const std::string& content, const std::string& source,
+                                               const std::filesystem::path& file, const RuntimeOptions& options) {
+    check(options);
+    auto state = std::make_shared<Model::State>();
+    state->metadata = detail::read_metadata(content, source);
+    state->network = detail::open_network(content, source, file, options);
+    return state;
+}
+
+/// Mask that asks the scores alone.
+detail::Mask keep_by_scores(const detail::PairInput& pair, const std::vector<float>& scores, const Options& options) {
+    if (options.keep_precision) {
+        return detail::largest_set_of_precision(scores, pair.valid, *options.keep_precision);
+    }
+    detail::Mask kept(scores.size());
+    for (std::size_t i = 0; i < scores.size(); ++i) {
+        kept[i] = scores[i] > 0.5F && pair.valid[i] != 0 ? 1 : 0;
+    }
+    return kept;
+}
+
+}  // namespace
+
+const char* to_string(Status status) noexcept {
+    switch (status) {
+        case Status::ok: return "ok";
+        case Status::too_few_matches: return "too_few_matches";
+        case Status::no_geometry: return "no_geometry";
+        case Status::low_support: return "low_support";
+        case Status::unrelated: return "unrelated";
+        case Status::planar: return "planar";
+        case Status::pure_rotation: return "pure_rotation";
+        case Status::suspicious_intrinsics: return "suspicious_intrinsics";
+    }
+    return "";
+}
+
+Model Model::from_file(const std::filesystem::path& file, const RuntimeOptions& options) {
+    return Model(open_model(detail::read_model_file(file), file.string(), file, options));
+}
+
+Model Model::from_memory(const void* data, std::size_t size, const RuntimeOptions& options) {
+    if (data == nullptr) {
+        throw ArgumentError("data: expected the bytes of a model file");
+    }
+    return Model(open_model(std::string(static_cast<const char*>(data), size), "model in memory", {}, options));
+}
+
+const std::string& Model::name() const noexcept { return state_->metadata.name; }
+
+const std::string& Model::version() const noexcept { return state_->metadata.version; }
+
+std::string Model::runtime() { return detail::runtime_name(); }
+
+Filter::Filter(Model model, const Options& options) : model_(std::move(model)), options_(options) { check(options); }
+
+Result Filter::operator()(const MatchPair& matches) const {
+    const detail::ModelMetadata& metadata = model_.state_->metadata;
+    // 1. Read the pair.
+    const detail::PairInput pair = detail::prepare_pair(matches);
+    Result result;
+    result.intrinsics_guessed = !pair.calibrated();
+    result.assumptions = pair.assumptions;
+
+    // 2. A run on the list alone may explain it.
+    std::optional<detail::Search> search;
+    std::optional<detail::TwoViewModel> model;
+    if (options_.method != Method::none) {
+        search.emplace(detail::gather_before(pair), metadata.choice, options_);
+        if (options_.method == Method::automatic && options_.effort == Effort::automatic) {
+            model = search->before_network();
+        }
+    }
+
+    // 3. Scores: from the residuals, or by the network, and the fit on what it saw.
+    const std::size_t count = pair.valid.size();
+    if (model) {
+        result.scores = detail::scores_by_residuals(pair, *model, metadata.choice);
+        for (std::size_t i = 0; i < count; ++i) {
+            result.logits.push_back(pair.valid[i] != 0 ? metadata.calibration.logit(result.scores[i])
+                                                       : detail::kInvalidLogit);
+        }
+    } else {
+        const detail::Rows sent = detail::select_network_input(pair, metadata, options_.seed);
+        const auto output = detail::run_network(*model_.state_->network, pair, sent);
+        result.num_network_matches = static_cast<int>(sent.size());
+        result.logits = detail::assemble_logits(pair, sent, output, metadata);
+        std::vector<float> margins;
+        for (std::size_t i = 0; i < count; ++i) {
+            result.scores.push_back(pair.valid[i] != 0 ? metadata.calibration.probability(result.logits[i]) : 0.0F);
+            margins.push_back(result.logits[i] - static_cast<float>(metadata.decision_threshold));
+        }
+        if (search) {
+            const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
+            model = search->with_network(detail::gather_scored(pair, sent, result.scores, margins, essential));
+        }
+    }
+
+    // 4. Re-test of all matches, and the verdict.
+    detail::Verdict verdict;
+    if (search) {
+        verdict = detail::judge(pair, model, search->evidence(), pair.threshold_px(options_.threshold),
+                                metadata.choice, options_);
+        if (options_.keep_precision && (verdict.F || verdict.R)) {
+            verdict.mask = keep_by_scores(pair, result.scores, options_);
+        }
+    } else {
+        verdict = detail::verdict_by_scores(pair, keep_by_scores(pair, result.scores, options_));
+    }
+    if (model) {
+        result.origin = model->origin;
+        result.ended = model->ended;
+        if (verdict.R) {
+            result.confidence = model->confidence;
+        }
+    }
+    result.status = verdict.status;
+    result.mask = std::move(verdict.mask);
+    result.num_inliers = static_cast<int>(std::count(result.mask.begin(), result.mask.end(), 1));
+    result.E = verdict.E;
+    result.F = verdict.F;
+    result.R = verdict.R;
+    result.t = verdict.t;
+    result.H = verdict.H;
+    result.support = verdict.support;
+    result.log10_false_alarms = verdict.log10_false_alarms;
+    result.focal_factor = verdict.focal_factor;
+    return result;
+}
+
+Result Filter::operator()(const Keypoints& keypoints1, const Keypoints& keypoints2, const Matches& matches,
+                          const Camera& camera1, const Camera& camera2) const {
+    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera1, camera2, {}});
+}
+
+Result Filter::operator()(const Keypoints& keypoints1, const Keypoints& keypoints2, const Matches& matches,
+                          const Camera& camera) const {
+    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera, camera, {}});
+}
+
+}  // namespace mgca

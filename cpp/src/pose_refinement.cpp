@@ -1,0 +1,181 @@
+#include "pose_refinement.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+
+namespace mgca::detail {
+namespace {
+
+constexpr double kInitialDamping = 1e-4;
+// Steps so short that they need more damping than this no longer pay.
+constexpr double kMaxDamping = 1.0;
+constexpr double kSmallestCurvature = 1e-12;
+constexpr double kConvergedDecrease = 1e-4;
+// Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
+constexpr double kReach = 12.0;
+
+using Vec5d = cv::Vec<double, 5>;
+using Matx55d = cv::Matx<double, 5, 5>;
+
+/// What a pose leaves of one match.
+struct SampsonTerm {
+    double r0, r1, r2;     // ray of image 1, in the second camera
+    double n0, n1, n2;     // x2 × t: normal of the epipolar plane
+    double error;          // x2^T E x1
+    double squared_norm;   // of the line normals
+
+    SampsonTerm(const Correspondence& match, const Pose& pose) {
+        const double* R = pose.R.val;
+        const double t0 = pose.t[0], t1 = pose.t[1], t2 = pose.t[2];
+        r0 = R[0] * match[0] + R[1] * match[1] + R[2];
+        r1 = R[3] * match[0] + R[4] * match[1] + R[5];
+        r2 = R[6] * match[0] + R[7] * match[1] + R[8];
+        n0 = match[3] * t2 - t1;
+        n1 = t0 - match[2] * t2;
+        n2 = match[2] * t1 - match[3] * t0;
+        error = r0 * n0 + r1 * n1 + r2 * n2;
+        const double l0 = t1 * r2 - t2 * r1, l1 = t2 * r0 - t0 * r2;
+        const double m0 = n0 * R[0] + n1 * R[3] + n2 * R[6], m1 = n0 * R[1] + n1 * R[4] + n2 * R[7];
+        squared_norm = std::max(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1, std::numeric_limits<double>::min());
+    }
+
+    double squared_distance() const { return error * error / squared_norm; }
+};
+
+/// Two unit vectors orthogonal to t.
+std::array<cv::Vec3d, 2> tangent_basis(const cv::Vec3d& t) {
+    const auto closer_to_zero = [](double a, double b) { return std::abs(a) < std::abs(b); };
+    const auto smallest = std::min_element(t.val, t.val + 3, closer_to_zero);
+    cv::Vec3d axis;
+    axis[static_cast<int>(smallest - t.val)] = 1.0;
+    const cv::Vec3d first = cv::normalize(t.cross(axis));
+    return {first, t.cross(first)};
+}
+
+Pose apply_step(const Pose& pose, const Vec5d& step) {
+    const auto basis = tangent_basis(pose.t);
+    return {rotation_from_vector({step[0], step[1], step[2]}) * pose.R,
+            cv::normalize(pose.t + step[3] * basis[0] + step[4] * basis[1])};
+}
+
+/// Gauss-Newton matrix and gradient of the squared Sampson distances of the matches within the threshold.
+struct NormalEquations {
+    Matx55d hessian;
+    Vec5d gradient;
+    int count = 0;  // of those matches
+
+    NormalEquations(const Correspondences& matches, const Pose& pose, double threshold) {
+        const auto basis = tangent_basis(pose.t);
+        std::array<double, 15> upper{};
+        for (const Correspondence& match : matches) {
+            const SampsonTerm term(match, pose);
+            if (!(term.squared_distance() < threshold * threshold)) {
+                continue;
+            }
+            // The line normals are held fixed: their derivative changes the step little and doubles the work.
+            const double scale = 1.0 / std::sqrt(term.squared_norm);
+            const double r0 = term.r0 * scale, r1 = term.r1 * scale, r2 = term.r2 * scale;
+            const double x2 = match[2], y2 = match[3];
+            const cv::Vec3d by_translation(r1 - r2 * y2, r2 * x2 - r0, r0 * y2 - r1 * x2);
+            const std::array<double, 5> row{r1 * term.n2 - r2 * term.n1, r2 * term.n0 - r0 * term.n2,
+                                            r0 * term.n1 - r1 * term.n0, by_translation.dot(basis[0]),
+                                            by_translation.dot(basis[1])};
+            std::size_t k = 0;
+            for (std::size_t i = 0; i < 5; ++i) {
+                for (std::size_t j = i; j < 5; ++j) {
+                    upper[k++] += row[i] * row[j];
+                }
+                gradient[static_cast<int>(i)] += term.error * scale * row[i];
+            }
+            ++count;
+        }
+        std::size_t k = 0;
+        for (int i = 0; i < 5; ++i) {
+            for (int j = i; j < 5; ++j) {
+                hessian(i, j) = hessian(j, i) = upper[k++];
+            }
+        }
+    }
+
+    /// The step against the gradient; shorter, the more damping.
+    Vec5d step(double damping) const {
+        Matx55d damped = hessian;
+        for (int k = 0; k < 5; ++k) {
+            damped(k, k) += damping * (hessian(k, k) + kSmallestCurvature);
+        }
+        return damped.solve(-gradient, cv::DECOMP_LU);
+    }
+};
+
+}  // namespace
+
+double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold) {
+    double cost = 0.0;
+    for (const Correspondence& match : matches) {
+        cost += std::min(SampsonTerm(match, pose).squared_distance(), threshold * threshold);
+    }
+    return cost;
+}
+
+cv::Matx33d rotation_from_vector(const cv::Vec3d& vector) {
+    const double angle = cv::norm(vector);
+    if (angle < 1e-12) {
+        return cv::Matx33d::eye() + cross_matrix(vector);
+    }
+    const cv::Matx33d k = cross_matrix(vector * (1.0 / angle));
+    return cv::Matx33d::eye() + std::sin(angle) * k + (1.0 - std::cos(angle)) * (k * k);
+}
+
+Pose refine_pose(const Correspondences& matches, const Pose& start, double threshold, int rounds) {
+    Correspondences reached;
+    reached.reserve(matches.size());
+    const double reach = kReach * threshold;
+    for (const Correspondence& match : matches) {
+        if (SampsonTerm(match, start).squared_distance() < reach * reach) {
+            reached.push_back(match);
+        }
+    }
+    if (static_cast<int>(reached.size()) < kMinRefinedInliers) {
+        return start;
+    }
+    Pose pose = start;
+    double cost = truncated_cost(reached, pose, threshold);
+    double damping = kInitialDamping;
+    for (int round = 0; round < rounds; ++round) {
+        const NormalEquations equations(reached, pose, threshold);
+        if (equations.count < kMinRefinedInliers) {
+            break;
+        }
+        const double previous = cost;
+        for (; damping < kMaxDamping; damping *= 10.0) {
+            const Pose candidate = apply_step(pose, equations.step(damping));
+            const double candidate_cost = truncated_cost(reached, candidate, threshold);
+            if (candidate_cost < cost) {
+                pose = candidate;
+                cost = candidate_cost;
+                damping *= 0.1;
+                break;
+            }
+        }
+        if (cost > (1.0 - kConvergedDecrease) * previous) {
+            break;
+        }
+    }
+    return pose;
+}
+
+double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise) {
+    if (static_cast<int>(inliers.size()) < kMinRefinedInliers) {
+        return 90.0;
+    }
+    const NormalEquations equations(inliers, pose, std::numeric_limits<double>::infinity());
+    cv::Mat eigenvalues;  // in descending order
+    cv::eigen(cv::Mat(equations.hessian), eigenvalues);
+    const double curvature = eigenvalues.at<double>(4);
+    const double radians = noise / std::sqrt(std::max(curvature, 1e-18));
+    return std::clamp(radians * 180.0 / CV_PI, 1e-3, 90.0);
+}
+
+}  // namespace mgca::detail

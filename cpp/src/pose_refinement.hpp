@@ -1,0 +1,31 @@
+// Least squares on the pose: Levenberg-Marquardt on the truncated Sampson error of all matches;
+// mgca_filter/geometry/pose_refinement.py.
+//
+// The pose has five degrees of freedom: a rotation vector applied on the left of R, and two steps of the unit
+// translation on its tangent plane (as PoseLib does; Hartley & Zisserman, 2nd ed., sec. 11.4.3).
+
+#pragma once
+
+#include "epipolar.hpp"
+
+namespace mgca::detail {
+
+constexpr int kMinRefinedInliers = 6;
+
+/// Refine a pose on the matches within the threshold (Sampson distance, normalised), which are chosen anew in every
+/// round; the truncated cost never rises.
+Pose refine_pose(const Correspondences& matches, const Pose& start, double threshold, int rounds = 10);
+
+/// Sum of squared Sampson distances, each cut off at the threshold: what MSAC minimises.
+double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold);
+
+/// Standard deviation of a pose along its worst direction, degrees, from the curvature of its inliers' cost: between
+/// 0.001 and 90, and 90 with fewer than six inliers.
+///
+/// @param noise standard deviation of the Sampson distance, normalised.
+double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise);
+
+/// Rotation about a vector by its length in radians (Rodrigues).
+cv::Matx33d rotation_from_vector(const cv::Vec3d& vector);
+
+}  // namespace mgca::detail

@@ -1,0 +1,73 @@
+#include "scoring.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <random>
+
+namespace mgca::detail {
+namespace {
+
+constexpr std::size_t kMaxNetworkMatches = 8000;
+// Rejected matches stay this far below the decision threshold, whatever the prior says.
+constexpr double kRejectedMargin = 1e-3;
+
+}  // namespace
+
+Rows select_network_input(const PairInput& pair, const ModelMetadata& metadata, int seed) {
+    Rows valid, rows;
+    std::vector<EncodedAttributes> attributes;
+    for (std::size_t i = 0; i < pair.valid.size(); ++i) {
+        if (pair.valid[i] != 0) {
+            valid.push_back(i);
+            attributes.push_back(pair.attributes[i]);
+        }
+    }
+    const Mask candidates = candidate_mask(attributes, metadata.candidate_max_ratio, metadata.candidate_min_count);
+    for (std::size_t k = 0; k < valid.size(); ++k) {
+        if (candidates[k] != 0) {
+            rows.push_back(valid[k]);
+        }
+    }
+    if (rows.size() > kMaxNetworkMatches) {
+        std::shuffle(rows.begin(), rows.end(), std::mt19937_64(static_cast<std::uint64_t>(seed)));
+        const auto ratio = [&](std::size_t i) {
+            return pair.attributes[i][kRatioKnown] > 0 ? pair.attributes[i][kRatio] : 1.0F;
+        };
+        std::stable_sort(rows.begin(), rows.end(), [&](std::size_t a, std::size_t b) { return ratio(a) < ratio(b); });
+        rows.resize(kMaxNetworkMatches);
+        std::sort(rows.begin(), rows.end());
+    }
+    return rows;
+}
+
+std::optional<NetworkOutput> run_network(const Network& network, const PairInput& pair, const Rows& sent) {
+    if (sent.empty()) {
+        return std::nullopt;
+    }
+    std::vector<float> correspondences, attributes;
+    for (const std::size_t i : sent) {
+        for (const double coordinate : pair.correspondences[i].val) {
+            correspondences.push_back(static_cast<float>(coordinate));
+        }
+        attributes.insert(attributes.end(), pair.attributes[i].begin(), pair.attributes[i].end());
+    }
+    return network.infer(correspondences, attributes);
+}
+
+std::vector<float> assemble_logits(const PairInput& pair, const Rows& sent, const std::optional<NetworkOutput>& output,
+                                   const ModelMetadata& metadata) {
+    std::vector<float> logits(pair.valid.size(), kInvalidLogit);
+    const auto ceiling = static_cast<float>(metadata.decision_threshold - kRejectedMargin);
+    for (std::size_t i = 0; i < logits.size(); ++i) {
+        if (pair.valid[i] != 0) {
+            logits[i] = std::min(metadata.prior.logit(pair.attributes[i]), ceiling);
+        }
+    }
+    for (std::size_t k = 0; output && k < sent.size(); ++k) {
+        // Degenerate input (all points equal, say) may leave the network without a finite answer.
+        logits[sent[k]] = std::isfinite(output->logits[k]) ? output->logits[k] : kInvalidLogit;
+    }
+    return logits;
+}
+
+}  // namespace mgca::detail

@@ -1,0 +1,248 @@
+// The public interface: misuse throws one family and names what is wrong, data never throws, every option is felt.
+
+#include "check.hpp"
+#include "golden_files.hpp"
+
+#include <atomic>
+#include <fstream>
+#include <iterator>
+#include <limits>
+#include <random>
+#include <thread>
+
+namespace {
+
+using mgca::ArgumentError;
+using mgca::Camera;
+using mgca::Filter;
+using mgca::Keypoints;
+using mgca::MatchPair;
+using mgca::Matches;
+using mgca::Model;
+using mgca::ModelError;
+using mgca::Options;
+using mgca::Result;
+using mgca::Status;
+
+std::string read_bytes(const std::filesystem::path& file) {
+    std::ifstream stream(file, std::ios::binary);
+    return {std::istreambuf_iterator<char>(stream), {}};
+}
+
+bool same(const Result& a, const Result& b) {
+    return a.mask == b.mask && a.scores == b.scores && a.logits == b.logits && a.status == b.status &&
+           a.R.has_value() == b.R.has_value() && (!a.R || cv::norm(*a.R - *b.R) == 0.0);
+}
+
+void options_are_checked(const Model& model) {
+    const auto with = [&](auto change, const char* words) {
+        Options options;
+        change(options);
+        check::throws<ArgumentError>([&] { const Filter filter(model, options); }, words);
+    };
+    with([](Options& o) { o.threshold = 0.0; }, "threshold");
+    with([](Options& o) { o.threshold = std::numeric_limits<double>::quiet_NaN(); }, "threshold");
+    with([](Options& o) { o.keep_precision = 1.0; }, "keep_precision");
+    with([](Options& o) { o.confidence = 0.0; }, "confidence");
+    with([](Options& o) { o.max_iterations = 0; }, "max_iterations");
+    with([](Options& o) { o.seed = -1; }, "seed");
+}
+
+void model_files_are_checked(const std::filesystem::path& file) {
+    const std::string content = read_bytes(file);
+    mgca::RuntimeOptions runtime;
+    runtime.threads = -1;
+    check::throws<ArgumentError>([&] { Model::from_file(file, runtime); }, "threads");
+    check::throws<ArgumentError>([] { Model::from_memory(nullptr, 0); }, "data");
+    check::throws<ModelError>([] { Model::from_file("no such file.onnx"); }, "no such file.onnx: model file not found");
+    check::throws<ModelError>([&] { Model::from_memory(content.data(), content.size() / 2); }, "truncated or damaged");
+    check::throws<ModelError>([] { Model::from_memory("hello, world", 12); }, "model in memory");
+    std::string other = content;
+    const std::size_t key = other.find("contract_version");
+    other[key + 18] = '9';  // behind the key: tag and length of the value
+    check::throws<ModelError>([&] { Model::from_memory(other.data(), other.size()); }, "contract version 9");
+    std::string unnamed = content;
+    unnamed.replace(unnamed.find("candidate_rule"), 14, "candidate_rale");
+    check::throws<ModelError>([&] { Model::from_memory(unnamed.data(), unnamed.size()); },
+                              "metadata missing: candidate_rule");
+    std::string broken = content;
+    broken.replace(broken.find("\"scale\""), 7, "\"scole\"");
+    check::throws<ModelError>([&] { Model::from_memory(broken.data(), broken.size()); }, "'calibration'");
+    std::string short_choice = content;
+    short_choice.replace(short_choice.find("\"early_end\""), 11, "\"early_and\"");
+    check::throws<ModelError>([&] { Model::from_memory(short_choice.data(), short_choice.size()); },
+                              "early_end is missing");
+    mgca::RuntimeOptions provider;
+    provider.providers = {"NoSuchExecutionProvider"};
+    check::throws<mgca::Error>([&] { Model::from_file(file, provider); }, "provider");
+    // All of one family, which is also a std::runtime_error.
+    check::throws<mgca::Error>([] { Model::from_file("no such file.onnx"); }, "not found");
+    check::throws<std::runtime_error>([] { Model::from_file("no such file.onnx"); }, "not found");
+}
+
+void models_are_named(const Model& model) {
+    check::that(!model.name().empty() && !model.version().empty(), "name and version of the model");
+    check::that(!Model::runtime().empty(), "name of the runtime");
+    check::equal(std::string(MGCA_VERSION),
+                 std::to_string(MGCA_VERSION_MAJOR) + "." + std::to_string(MGCA_VERSION_MINOR) + "." +
+                     std::to_string(MGCA_VERSION_PATCH),
+                 "version macros agree");
+}
+
+void inputs_are_checked(const Model& model, const MatchPair& good) {
+    const Filter filter(model);
+    const auto with = [&](auto change, const char* words) {
+        MatchPair pair = good;
+        change(pair);
+        check::throws<ArgumentError>([&] { filter(pair); }, words);
+    };
+    with([](MatchPair& p) { p.matches.index2[5] = 1000000; }, "matches[5]: index out of range");
+    with([](MatchPair& p) { p.matches.index1[5] = -1; }, "matches[5]: index out of range");
+    with([](MatchPair& p) { p.matches.index1.pop_back(); }, "index1 and index2");
+    with([](MatchPair& p) { p.matches.distances.pop_back(); }, "matches.distances");
+    with([](MatchPair& p) { p.matches.second_distances.pop_back(); }, "matches.second_distances");
+    with([](MatchPair& p) { p.keypoints1.sizes.pop_back(); }, "keypoints1.sizes");
+    with([](MatchPair& p) { p.keypoints2.angles.pop_back(); }, "keypoints2.angles");
+    with([](MatchPair& p) { p.attributes.ratio = {0.5F}; }, "attributes.ratio");
+    with([](MatchPair& p) { p.attributes.best = {1}; }, "attributes.best");
+    with([](MatchPair& p) { p.camera1.K = cv::Matx33d::zeros(); }, "camera1.K");
+    with([](MatchPair& p) { p.camera2.K = -*p.camera1.K; }, "camera2.K");
+    with([](MatchPair& p) { p.camera1.K.reset(); p.camera2.K = cv::Matx33d::eye(); }, "camera1.K");
+    with([](MatchPair& p) { p.camera1.distortion = {0.1, 0.2, 0.3}; }, "camera1.distortion");
+    with([](MatchPair& p) { p.camera2.distortion = std::vector<double>(5, NAN); }, "camera2.distortion");
+    with([](MatchPair& p) { p.camera1 = Camera(cv::Size2d(640, 480)); p.camera1.distortion = {0, 0, 0, 0}; },
+         "distortion coefficients need K");
+    with([](MatchPair& p) { p.camera1.size = {0.5, 480.0}; }, "camera1.size");
+    with([](MatchPair& p) { p.camera1.size = {640, 480}; p.camera2 = Camera(cv::Size2d(480, 640)); },
+         "one K cannot be right");
+    const std::vector<std::vector<cv::DMatch>> negative{{cv::DMatch(-1, -1, 1.0F)}};
+    check::throws<ArgumentError>([&] { filter(good.keypoints1, good.keypoints2, negative); }, "matches[0]");
+}
+
+void data_never_throws(const Model& model) {
+    std::mt19937 random(7);
+    const float nan = std::numeric_limits<float>::quiet_NaN(), infinity = std::numeric_limits<float>::infinity();
+    const Camera camera(cv::Matx33d(800, 0, 320, 0, 800, 240, 0, 0, 1));
+    std::vector<float> special{0.0F, -0.0F, 1.0F, nan, infinity, -infinity, 1e30F, 1e-30F, 100.0F, 1e6F};
+    for (const mgca::Method method : {mgca::Method::automatic, mgca::Method::prosac, mgca::Method::magsac,
+                                      mgca::Method::ransac, mgca::Method::none}) {
+        for (const int count : {0, 1, 2, 5, 7, 8, 9, 33, 70}) {
+            for (const bool calibrated : {true, false}) {
+                std::vector<cv::Point2f> points1, points2;
+                std::vector<cv::DMatch> matches;
+                for (int i = 0; i < count; ++i) {
+                    const auto draw = [&] {
+                        return random() % 4 == 0 ? special[random() % special.size()]
+                                                 : static_cast<float>(random() % 6400) / 10.0F;
+                    };
+                    points1.emplace_back(draw(), draw());
+                    points2.emplace_back(draw(), draw());
+                    matches.emplace_back(i, i, random() % 5 == 0 ? nan : draw());
+                }
+                Options options;
+                options.method = method;
+                try {
+                    const Result result = Filter(model, options)(points1, points2, matches, calibrated ? camera : Camera());
+                    check::equal(result.mask.size(), matches.size(), "length of the mask");
+                    check::equal(result.scores.size(), matches.size(), "length of the scores");
+                } catch (const std::exception& error) {
+                    check::that(false, std::string("data raised: ") + error.what());
+                }
+            }
+        }
+    }
+}
+
+void options_are_felt(const Model& model, const MatchPair& pair) {
+    const auto answer = [&](auto change) {
+        Options options;
+        options.effort = mgca::Effort::full;
+        change(options);
+        return Filter(model, options)(pair);
+    };
+    const Result plain = answer([](Options&) {});
+    check::that(plain.ok() && plain.num_network_matches > 0, "the pair goes through the network");
+    check::that(same(plain, answer([](Options&) {})), "same options, same answer");
+    check::that(answer([](Options& o) { o.threshold = 0.3; }).num_inliers < plain.num_inliers, "threshold is felt");
+    check::that(answer([](Options& o) { o.keep_precision = 0.999; }).mask != plain.mask, "keep_precision is felt");
+    // One estimator alone, whose answer no other outvotes.
+    const auto alone = [&](auto change) {
+        return answer([&](Options& o) {
+            o.method = mgca::Method::magsac;
+            change(o);
+        });
+    };
+    const Result magsac = alone([](Options&) {});
+    check::that(!same(magsac, alone([](Options& o) { o.max_iterations = 1; })), "max_iterations is felt");
+    check::that(!same(magsac, alone([](Options& o) { o.seed = 11; })), "seed is felt");
+    check::that(!same(magsac, alone([](Options& o) { o.confidence = 1e-6; })), "confidence is felt");
+    check::that(answer([](Options& o) { o.method = mgca::Method::none; }).R.has_value() == false, "method is felt");
+    check::equal(answer([](Options& o) { o.method = mgca::Method::magsac; }).origin, std::string("magsac"), "method");
+}
+
+void cameras_are_felt(const Model& model, const MatchPair& pair) {
+    const Filter filter(model);
+    const Result guessed = filter(pair.keypoints1, pair.keypoints2, pair.matches);
+    check::that(guessed.intrinsics_guessed && !guessed.confidence, "without K it is guessed");
+    const Result by_size = filter(pair.keypoints1, pair.keypoints2, pair.matches, Camera(cv::Size2d(2000, 1000)));
+    check::that(by_size.assumptions != guessed.assumptions, "the size helps the guess");
+    Camera bent = pair.camera1;
+    bent.distortion = {-0.3, 0.1, 0.0, 0.0};
+    const Result straight = filter(pair.keypoints1, pair.keypoints2, pair.matches, pair.camera1);
+    const Result distorted = filter(pair.keypoints1, pair.keypoints2, pair.matches, bent);
+    check::that(straight.mask != distorted.mask, "distortion is felt");
+    check::that(same(straight, filter(pair)), "one camera is both");
+}
+
+void threads_share_a_filter(const Model& model, const MatchPair& pair) {
+    Options options;
+    options.effort = mgca::Effort::full;
+    const Filter filter(model, options);
+    const Result expected = filter(pair);
+    std::atomic<int> different{0};
+    std::vector<std::thread> threads;
+    for (int i = 0; i < 4; ++i) {
+        threads.emplace_back([&] {
+            const Filter copy = filter;
+            for (int round = 0; round < 3; ++round) {
+                different += same(copy(pair), expected) ? 0 : 1;
+            }
+        });
+    }
+    for (std::thread& thread : threads) {
+        thread.join();
+    }
+    check::equal(different.load(), 0, "threads give the same answer");
+}
+
+void memory_and_file_agree(const std::filesystem::path& file, const Model& model, const MatchPair& pair) {
+    mgca::RuntimeOptions runtime;
+    runtime.threads = 2;
+    const Filter from_memory = [&] {
+        const std::string content = read_bytes(file);  // gone before the filter is used
+        return Filter(Model::from_memory(content.data(), content.size(), runtime));
+    }();
+    check::that(same(from_memory(pair), Filter(model)(pair)), "a model in memory, on two threads, answers the same");
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    if (argc != 3) {
+        std::cerr << "usage: test_interface GOLDEN_FOLDER MODEL\n";
+        return 2;
+    }
+    const std::filesystem::path golden = argv[1], file = argv[2];
+    const Model model = Model::from_file(file);
+    const MatchPair pair = golden::read_input(golden, "wide");
+    options_are_checked(model);
+    model_files_are_checked(file);
+    models_are_named(model);
+    inputs_are_checked(model, golden::read_input(golden, "general"));
+    data_never_throws(model);
+    options_are_felt(model, pair);
+    cameras_are_felt(model, pair);
+    threads_share_a_filter(model, pair);
+    memory_and_file_agree(file, model, pair);
+    return check::result("interface");
+}

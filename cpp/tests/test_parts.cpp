@@ -1,0 +1,300 @@
+// Laws of the parts behind the public header.
+
+#include "attributes.hpp"
+#include "calibration.hpp"
+#include "check.hpp"
+#include "choice.hpp"
+#include "degeneracy.hpp"
+#include "estimators.hpp"
+#include "evidence.hpp"
+#include "focal_check.hpp"
+#include "homography.hpp"
+#include "json.hpp"
+#include "pose_refinement.hpp"
+#include "robust_fit.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+#include <random>
+#include <stdexcept>
+
+namespace {
+
+using namespace mgca::detail;  // NOLINT: a test of what is in there
+
+constexpr double kFocal = 800.0;
+
+/// Matches of random points at depths of 4 to 11, with noise, all within the view of both cameras.
+Correspondences draw_matches(const Pose& pose, int count, double noise_px, unsigned seed) {
+    std::mt19937 random(seed);
+    std::uniform_real_distribution<double> x(-0.4, 0.4), depth(4.0, 11.0);
+    std::normal_distribution<double> noise(0.0, noise_px / kFocal);
+    Correspondences matches;
+    for (int i = 0; i < count; ++i) {
+        const cv::Vec3d point = depth(random) * cv::Vec3d(x(random), x(random), 1.0);
+        const cv::Vec3d second = pose.R * point + pose.t;
+        matches.emplace_back(point[0] / point[2] + noise(random), point[1] / point[2] + noise(random),
+                             second[0] / second[2] + noise(random), second[1] / second[2] + noise(random));
+    }
+    return matches;
+}
+
+Correspondences draw_wrong(int count, unsigned seed) {
+    std::mt19937 random(seed);
+    std::uniform_real_distribution<double> x(-0.4, 0.4);
+    Correspondences matches;
+    for (int i = 0; i < count; ++i) {
+        matches.emplace_back(x(random), x(random), x(random), x(random));
+    }
+    return matches;
+}
+
+const Pose kPose{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.2, 0.1))};
+
+void json_is_read() {
+    const Json value = Json::parse(R"( {"a": [1, -2.5e-3, 1e+2], "b": {"c": "x\u00e9\n\"", "d": null}, "e": true} )");
+    check::that(value["a"].numbers() == std::vector<double>{1.0, -2.5e-3, 100.0}, "numbers");
+    check::equal(value["b"]["c"].text(), std::string("x\xc3\xa9\n\""), "escapes");
+    check::that(!value["b"].has("d") && value["b"]["d"].is_null() && value["e"].boolean(), "null and true");
+    for (const char* text : {"", "{", "[1,]", "[1 2]", "{\"a\"}", "nul", "\"\\x\"", "1e999", "[1]x", "\"\\u12\"", "nan",
+                             "{\"a\":1,}", "-", "\"abc"}) {
+        check::throws<std::invalid_argument>([&] { Json::parse(text); }, "");
+    }
+    check::throws<std::invalid_argument>([] { Json::parse(std::string(1000, '[')); }, "nested too deeply");
+    check::throws<std::invalid_argument>([&] { value["z"].number(); }, "z is missing");
+    check::throws<std::invalid_argument>([&] { value["e"].number(); }, "expected a number");
+}
+
+void exact_matches_have_no_residual() {
+    const cv::Matx33d E = essential_from_pose(kPose);
+    check::near(cv::norm(E), 1.0, 1e-12, "unit norm");
+    for (const Correspondence& match : draw_matches(kPose, 50, 0.0, 1)) {
+        check::near(sampson_distance(match, E), 0.0, 1e-12, "Sampson distance of an exact match");
+        const Correspondence swapped(match[2], match[3], match[0], match[1]);
+        check::near(sampson_distance(swapped, E.t()), 0.0, 1e-12, "swapped images transpose E");
+    }
+    const auto pose = pose_from_essential(E, draw_matches(kPose, 50, 0.1, 2), kFocal);
+    check::near(pose_angle_deg(*pose, kPose), 0.0, 1e-5, "the pose comes back from E");
+    check::near(cv::norm(pose->t - kPose.t), 0.0, 1e-9, "with the sign of t");
+    check::that(!pose_from_essential(cv::Matx33d::zeros(), draw_matches(kPose, 50, 0.1, 2), kFocal), "zero is no E");
+}
+
+void refinement_finds_the_pose_and_never_raises_the_cost() {
+    for (unsigned seed = 0; seed < 5; ++seed) {
+        Correspondences matches = draw_matches(kPose, 200, 0.3, seed);
+        const Correspondences wrong = draw_wrong(100, seed + 50);
+        matches.insert(matches.end(), wrong.begin(), wrong.end());
+        std::mt19937 random(seed);
+        std::normal_distribution<double> small(0.0, 0.002);
+        const Pose start{rotation_from_vector({small(random), small(random), small(random)}) * kPose.R,
+                         cv::normalize(kPose.t + cv::Vec3d(small(random), small(random), small(random)))};
+        const double threshold = 2.0 / kFocal;
+        const Pose refined = refine_pose(matches, start, threshold);
+        check::that(truncated_cost(matches, refined, threshold) <= truncated_cost(matches, start, threshold), "cost");
+        check::near(pose_angle_deg(refined, kPose), 0.0, 0.5, "refined pose");
+        check::near(cv::norm(refined.R * refined.R.t() - cv::Matx33d::eye()), 0.0, 1e-9, "a rotation");
+    }
+    const Pose untouched = refine_pose(draw_matches(kPose, 5, 0.3, 0), kPose, 1.0 / kFocal);
+    check::near(cv::norm(untouched.R - kPose.R), 0.0, 0.0, "five matches refine nothing");
+    const double firm = pose_uncertainty_deg(draw_matches(kPose, 400, 0.3, 3), kPose, 0.5 / kFocal);
+    const double loose = pose_uncertainty_deg(draw_matches(kPose, 100, 0.3, 3), kPose, 0.5 / kFocal);
+    check::that(firm < loose && loose < 10.0, "more matches hold the pose more firmly");
+    check::near(pose_uncertainty_deg({}, kPose, 1e-3), 90.0, 0.0, "nothing holds a pose of no matches");
+}
+
+void repetitions_count_once() {
+    const Correspondences matches{{3, 0, 0, 0}, {1, 2, 3, 4}, {3, 0, 0, 0}, {1, 2, 9, 9}, {5, 5, 3, 4}, {7, 7, 8, 8}};
+    check::that(distinct_rows(matches) == Rows{0, 1, 3, 4, 5}, "distinct rows, the first of equals");
+    const Correspondences distinct{{1, 2, 3, 4}, {1, 2, 9, 9}, {5, 5, 3, 4}, {7, 7, 8, 8}};
+    check::that(one_to_one(distinct) == Mask{1, 0, 0, 1}, "a keypoint counts in its best match");
+}
+
+void raw_lists_are_told_from_filtered_ones() {
+    std::vector<EncodedAttributes> attributes(20, EncodedAttributes{0.5F, 1.0F, 0, 0, 0, 1.0F, 1.0F, 0});
+    attributes[3][kRatio] = 0.95F;
+    const Mask valid(20, 1);
+    check::that(listed_rows(attributes, valid) == valid, "all of a filtered list counts");
+    attributes[7][kBest] = 0.0F;
+    Mask expected = valid;
+    expected[3] = expected[7] = 0;
+    check::that(listed_rows(attributes, valid) == expected, "of a raw list the best with a clear ratio");
+}
+
+void evidence_is_taken_from_above_a_margin() {
+    Evidence evidence;
+    evidence.correspondences = draw_wrong(60, 1);
+    evidence.rows.resize(60);
+    std::iota(evidence.rows.begin(), evidence.rows.end(), std::size_t{0});
+    evidence.once.assign(60, 1);
+    evidence.listed.assign(60, 0);
+    evidence.listed[4] = evidence.listed[2] = 1;
+    evidence.order.assign(60, std::numeric_limits<double>::quiet_NaN());
+    evidence.order[4] = 0.1;
+    check::that(evidence.accepted() == Rows{2, 4}, "before the network the listed ones are accepted");
+    check::that(evidence.by_list_order()[0] == evidence.correspondences[4], "what is known comes first");
+    evidence.network.emplace();
+    for (int i = 0; i < 60; ++i) {
+        evidence.network->scores.push_back(i < 40 ? 0.9 : 0.1);
+        evidence.network->margins.push_back(2.0 - 0.1 * i);
+    }
+    check::equal(evidence.accepted().size(), std::size_t{40}, "accepted by score");
+    check::equal(evidence.above(-1.05).size(), std::size_t{31 + 1}, "fewer than 32 give way to the best 32");
+    check::equal(evidence.above(-2.05).size(), std::size_t{41}, "above a margin");
+}
+
+void a_line_a_rotation_and_a_plane_are_recognised() {
+    std::vector<cv::Point2d> points;
+    for (int i = 0; i < 50; ++i) {
+        points.emplace_back(0.01 * i, 0.005 * i + (i % 10 == 0 ? 0.2 : 0.0));
+    }
+    const std::vector<double> distances = line_distances(points, 1e-3);
+    check::that(std::count_if(distances.begin(), distances.end(), [](double d) { return d < 1e-3; }) == 45, "a line");
+    const Pose turn{kPose.R, {0.0, 0.0, 0.0}};
+    const Correspondences turned = draw_matches(turn, 100, 0.0, 4);
+    check::near(cv::norm(fit_rotation(turned, 1e-3) - kPose.R), 0.0, 1e-9, "a rotation");
+    Correspondences plane;
+    for (const Correspondence& match : draw_matches(kPose, 100, 0.0, 5)) {
+        const cv::Vec3d second = kPose.R * (5.0 * ray1(match)) + kPose.t;
+        plane.emplace_back(match[0], match[1], second[0] / second[2], second[1] / second[2]);
+    }
+    const auto H = fit_homography(plane, 2.0 / kFocal, 0);
+    if (check::that(H.has_value(), "a homography of a plane")) {
+        const std::vector<double> errors = homography_distances(plane, *H);
+        check::near(*std::max_element(errors.begin(), errors.end()), 0.0, 1e-6, "which explains all of it");
+        double closest = 180.0;
+        for (const Pose& pose : poses_from_homography(*H)) {
+            closest = std::min(closest, pose_angle_deg(pose, kPose));
+        }
+        check::near(closest, 0.0, 0.01, "and allows the true pose");
+    }
+}
+
+void chance_is_told_from_support() {
+    const cv::Matx33d E = essential_from_pose(kPose);
+    Correspondences matches = draw_matches(kPose, 60, 0.3, 6);
+    const Correspondences wrong = draw_wrong(200, 7);
+    const Support chance = measure_support(wrong, E, 1.0 / kFocal);
+    matches.insert(matches.end(), wrong.begin(), wrong.end());
+    const Support support = measure_support(matches, E, 1.0 / kFocal);
+    check::that(support.log10_nfa < -20.0 && chance.log10_nfa > kUnrelatedLog10Nfa, "number of false alarms");
+    check::that(std::isinf(log10_false_alarms(100, 5, 0.01)), "five matches prove nothing");
+}
+
+void a_wrong_focal_length_is_noticed() {
+    const Pose skew{rotation_from_vector({0.05, -0.3, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.6, 0.5))};
+    const Correspondences right = draw_matches(skew, 300, 0.2, 8);
+    check::that(!better_focal_factor(right, skew, 1.0 / kFocal).has_value(), "the right focal length will do");
+    Correspondences zoomed;
+    for (const Correspondence& match : right) {
+        zoomed.push_back(match * 1.5);  // as if the focal length were two thirds of what it is
+    }
+    const double focal = kFocal / 1.5;
+    EstimatorOptions options;
+    options.threshold_px = 1.0;
+    const auto E = fit_epipolar(zoomed, focal, options, true);
+    const Pose pose = refine_pose(zoomed, *pose_from_essential(*E, zoomed, focal), 1.0 / focal);
+    const auto factor = better_focal_factor(zoomed, pose, 1.0 / focal);
+    check::that(factor.has_value(), "two thirds of it will not");
+    check::near(factor.value_or(0.0), 1.5, 0.3, "and the factor is about one and a half");
+}
+
+Coefficients coefficients() {
+    return Coefficients::read(Json::parse(R"({
+        "score_trust": [0.8, 0.5, 0.05], "noise_px": [0.25, 0.6, 1.5], "noise_weights": [0.4, 0.4, 0.2],
+        "noise_scales": [1.0, 1.7], "outlier_width_px": [300], "seen_behind": [0.02],
+        "early_end": [0.5, 50, 0.03, 0.5, 20], "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
+        "confidence": [1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0], "early_confidence": [0,0,0,0,0,0,1]})"));
+}
+
+void the_likelier_hypothesis_is_chosen() {
+    Correspondences matches = draw_matches(kPose, 80, 0.3, 9);
+    const Correspondences wrong = draw_wrong(80, 10);
+    matches.insert(matches.end(), wrong.begin(), wrong.end());
+    std::vector<double> scores(160, 0.1);
+    std::fill(scores.begin(), scores.begin() + 80, 0.9);
+    const Pose other{rotation_from_vector({0.3, 0.0, 0.1}), {0.0, 0.0, 1.0}};
+    const std::vector<Hypothesis> hypotheses{{other, Family::network}, {kPose, Family::accepted}};
+    Coefficients c = coefficients();
+    const Judgement judged = judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c);
+    check::equal(judged.chosen, std::size_t{1}, "the true pose");
+    check::that(judged[Feature::likelihood_to_rival] > 3.0, "far from its rival");
+    check::near(judged[Feature::no_network], 1.0, 0.0, "no network E");
+    check::equal(judge_hypotheses(matches, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
+                 "without scores as well");
+    // Confidence is the logistic function of the weighted features.
+    check::near(confidence(judged, c), 1.0 / (1.0 + std::exp(-judged[Feature::log_count])), 1e-12, "confidence");
+    check::near(early_confidence(judged, c), 1.0 / (1.0 + std::exp(-1.0)), 1e-12, "early confidence");
+    c.support_weight = -1e3;  // relative support against itself: the worst supported one wins
+    check::equal(judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
+                 "support_weight is felt");
+    check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse("{}")); }, "score_trust is missing");
+    check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse(R"({"score_trust": [1]})")); },
+                                         "score_trust: expected 3");
+}
+
+void residuals_become_scores() {
+    const Correspondences matches = draw_matches(kPose, 60, 0.3, 11);
+    Correspondences all = matches;
+    const Correspondences wrong = draw_wrong(60, 12);
+    all.insert(all.end(), wrong.begin(), wrong.end());
+    const Residuals residuals = measure_residuals(all, kPose, kFocal);
+    const std::vector<double> scores = posterior(residuals, {Mask(120, 1)}, 1.0, coefficients());
+    const double right = std::accumulate(scores.begin(), scores.begin() + 60, 0.0) / 60.0;
+    const double mistaken = std::accumulate(scores.begin() + 60, scores.end(), 0.0) / 60.0;
+    check::that(right > 0.9 && mistaken < 0.1, "right matches score high, wrong ones low");
+}
+
+void probabilities_and_logits_are_inverse() {
+    const Calibration calibration{0.934, -1.33};
+    for (const float logit : {-8.0F, -1.0F, 0.0F, 2.5F, 7.0F}) {
+        check::near(calibration.logit(calibration.probability(logit)), logit, 1e-2, "logit of a probability");
+    }
+    check::that(largest_set_of_precision({0.9F, 0.2F, 0.8F, 0.8F, 0.99F}, {1, 1, 1, 1, 0}, 0.83) ==
+                    std::vector<unsigned char>{1, 0, 1, 1, 0},
+                "the largest set of a precision, equals together, the invalid left out");
+    check::that(largest_set_of_precision({0.1F}, {1}, 0.5) == std::vector<unsigned char>{0}, "none reaches it");
+    check::near(distance_ratio(1.0, 0.0), 1.0, 0.0, "two candidates at distance zero");
+    check::that(!best_of_list({0, 1}, {1.0, 1.0}).has_value(), "equal distances say nothing");
+    check::that(best_of_list({0, 0, 1, -1}, {1.0, 2.0, 3.0, NAN}) == std::vector<unsigned char>{1, 0, 1, 0},
+                "best of the list");
+}
+
+void guessed_and_seeded_estimators_answer() {
+    Correspondences matches = draw_matches(kPose, 120, 0.2, 13);
+    for (const Estimator method : {Estimator::prosac, Estimator::magsac, Estimator::ransac}) {
+        for (const bool calibrated : {true, false}) {
+            EstimatorOptions options;
+            options.method = method;
+            options.seed = 3;
+            const auto M = fit_epipolar(matches, kFocal, options, calibrated);
+            if (check::that(M.has_value(), "an estimator finds the model")) {
+                check::near(cv::norm(*M), 1.0, 1e-12, "of unit norm");
+                const std::vector<double> distances = sampson_distances(matches, *M);
+                const auto near = std::count_if(distances.begin(), distances.end(),
+                                                [](double distance) { return distance < 1.0 / kFocal; });
+                check::that(near > 100, "that nearly all agree with");
+            }
+        }
+    }
+}
+
+}  // namespace
+
+int main() {
+    json_is_read();
+    exact_matches_have_no_residual();
+    refinement_finds_the_pose_and_never_raises_the_cost();
+    repetitions_count_once();
+    raw_lists_are_told_from_filtered_ones();
+    evidence_is_taken_from_above_a_margin();
+    a_line_a_rotation_and_a_plane_are_recognised();
+    chance_is_told_from_support();
+    a_wrong_focal_length_is_noticed();
+    the_likelier_hypothesis_is_chosen();
+    residuals_become_scores();
+    probabilities_and_logits_are_inverse();
+    guessed_and_seeded_estimators_answer();
+    return check::result("parts");
+}

@@ -1,0 +1,167 @@
+"""The C++ library is built, passes its own tests, and gives Python's answers on this very machine.
+
+Needs CMake, a C++ compiler, OpenCV's headers, and ONNX Runtime's headers and library: in the folder that the
+environment variable ONNXRUNTIME_ROOT names (include/ and lib/), or where CMake looks by itself. Where something is
+missing these tests are skipped with the reason; with MGCA_REQUIRE_CPP=1 they fail instead. MGCA_CPP_BUILD names a
+folder in which the library is built already, or is built and stays.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import pytest
+
+import mgca_filter
+
+ROOT = Path(__file__).parent.parent
+SOURCE = ROOT / "cpp"
+IMAGES = ROOT / "examples" / "images"
+_BUILDS = tempfile.TemporaryDirectory(prefix="mgca_cpp_")
+# The compiler may take minutes on a busy machine.
+pytestmark = pytest.mark.timeout(1200)
+
+
+def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True)
+
+
+def missing(reason: str) -> None:
+    """Skip, or fail where C++ must be tested."""
+    if os.environ.get("MGCA_REQUIRE_CPP") == "1":
+        pytest.fail(f"MGCA_REQUIRE_CPP=1, but {reason}")
+    pytest.skip(reason)
+
+
+@functools.cache
+def build_folder() -> Path:
+    """The library, its tool and its tests, built once."""
+    for tool in ("cmake", os.environ.get("CXX", "c++")):
+        if shutil.which(tool) is None:
+            missing(f"{tool} is not there")
+    folder = Path(os.environ.get("MGCA_CPP_BUILD", str(Path(_BUILDS.name) / "build")))
+    done = run("cmake", "-S", SOURCE, "-B", folder)
+    words = re.sub(r"\s+", " ", done.stderr)
+    if done.returncode and "OpenCVConfig.cmake" in words:
+        missing("OpenCV's headers are not there (Debian: libopencv-dev)")
+    if done.returncode and "No ONNX Runtime" in words:
+        missing("ONNX Runtime's headers and library are not there; ONNXRUNTIME_ROOT may name their folder")
+    assert done.returncode == 0, done.stdout + done.stderr
+    done = run("cmake", "--build", folder, "--config", "Release")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def build() -> Path:
+    return build_folder()
+
+
+def program(build: Path, name: str) -> Path:
+    return next(path for path in build.rglob(f"{name}*") if path.is_file() and os.access(path, os.X_OK))
+
+
+def test_own_tests_of_the_library(build):
+    done = run("ctest", "--test-dir", build, "--output-on-failure", "-C", "Release")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "100% tests passed" in done.stdout
+
+
+def test_answers_are_those_of_python_on_this_machine(build, tmp_path):
+    """With the same OpenCV in every bit that counts; else as another seed would have it."""
+    shutil.copytree(ROOT / "tests" / "golden" / "inputs", tmp_path / "inputs")
+    shutil.copy(ROOT / "tests" / "golden" / "cases.json", tmp_path)
+    writer = ROOT / "tests" / "golden" / "write_goldens.py"
+    written = run(sys.executable, writer, "--expected-only", "--quick", "--out", tmp_path)
+    assert written.returncode == 0, written.stderr
+    tests = program(build, "test_golden")
+    done = run(tests, tmp_path, mgca_filter.model_path())
+    assert done.returncode == 0, done.stdout + done.stderr
+    if f"OpenCV {cv2.__version__}\n" in done.stdout:
+        done = run(tests, tmp_path, mgca_filter.model_path(), "exact")
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_version_is_that_of_the_package():
+    header = (SOURCE / "include" / "mgca" / "version.hpp").read_text(encoding="utf-8")
+    numbers = [re.search(rf"VERSION_{part} (\d+)", header)[1] for part in ("MAJOR", "MINOR", "PATCH")]
+    assert ".".join(numbers) == re.search(r'MGCA_VERSION "(.*)"', header)[1] == mgca_filter.__version__
+
+
+def test_public_header_names_no_runtime():
+    text = (SOURCE / "include" / "mgca" / "filter.hpp").read_text(encoding="utf-8")
+    included = set(re.findall(r"#include <(.*)>", text))
+    assert {name for name in included if "/" in name} == {"mgca/version.hpp", "opencv2/core.hpp"}
+    assert "Ort::" not in text
+
+
+def camera() -> str:
+    K = json.loads((IMAGES / "pair.json").read_text(encoding="utf-8"))["K1"]
+    return ",".join(repr(float(value)) for value in (K[0][0], K[1][1], K[0][2], K[1][2]))
+
+
+def test_tool_answers_in_words_and_json(build):
+    tool = program(build, "mgca_match")
+    images = (IMAGES / "left.jpg", IMAGES / "right.jpg", "--model", mgca_filter.model_path())
+    done = run(tool, *images, "--K", camera())
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"status +ok\n", done.stdout)
+    done = run(tool, *images, "--K", camera(), "--json", "--method", "magsac", "--seed", "3", "--threads", "2")
+    answer = json.loads(done.stdout)
+    assert done.returncode == 0
+    assert (answer["status"], answer["num_inliers"]) == ("ok", sum(answer["mask"]))
+    assert len(answer["scores"]) == len(answer["mask"]) > 1000
+    guessed = run(tool, *images, "--max-keypoints", "500")
+    assert "guessed from the image size" in guessed.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "expected two images"),
+        (["a.png", "b.png"], "expected --model"),
+        (["a.png", "b.png", "--model", "m.onnx", "--K", "1,2,3"], "--K: expected fx,fy,cx,cy"),
+        (["a.png", "b.png", "--model", "m.onnx", "--no", "1"], "--no: unknown"),
+        (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "--method: unknown"),
+        (["a.png", "b.png", "--model", "m.onnx", "--seed", "1.5"], "--seed: expected an integer"),
+        (["a.png", "b.png", "--model", "m.onnx"], "m.onnx: model file not found"),
+        (["a.png", "b.png", "--model", str(mgca_filter.model_path())], "a.png: not a readable image"),
+        (["a.png", "b.png", "--model", str(mgca_filter.model_path()), "--threshold", "0"], "threshold: expected"),
+    ],
+)
+def test_tool_names_what_is_wrong(build, words, message):
+    done = run(program(build, "mgca_match"), *words)
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+def test_odometry_times_every_frame(build, image_folder):
+    """The example is built by the library's test of its installation."""
+    found = [path for path in build.rglob("odometry*") if path.is_file() and os.access(path, os.X_OK)]
+    assert found, "run test_own_tests_of_the_library first"
+    done = run(found[0], image_folder, mgca_filter.model_path(), "800,800,319.5,239.5")
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+
+
+def test_opencv_4_alone_is_refused(build, tmp_path):
+    version = re.search(r"OpenCV ([\d.]+)", run(program(build, "test_golden"), *golden_arguments()).stdout)
+    assert version is not None
+    done = run("cmake", "-S", SOURCE, "-B", tmp_path, "-DMGCA_RUNTIME=opencv")
+    if int(version[1].split(".")[0]) >= 5:
+        assert done.returncode == 0
+    else:
+        assert "cannot run the model" in re.sub(r"\s+", " ", done.stderr)
+
+
+def golden_arguments() -> tuple[Path, Path]:
+    return ROOT / "tests" / "golden", mgca_filter.model_path()
