@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from ..fit.homography_fit import HomographyFit, HomographyOptions, estimate_homography
 from ..fit.planarity import MEANINGFUL_LOG10_NFA, homography_false_alarms
-from ..geometry.epipolar import essential_from_pose
+from ..geometry.epipolar import essential_from_pose, project_to_essential
 from ..geometry.homography import scaled_homography, transfer
 from ..inputs.keypoints import read_keypoints
 from ..inputs.options import FilterOptions, check_integer, check_number
