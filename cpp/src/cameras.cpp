@@ -4,8 +4,10 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 #include <limits>
 #include <sstream>
+#include <tuple>
 
 namespace mgca::detail {
 namespace {
@@ -20,6 +22,10 @@ constexpr double kLargestPx = 1e6;
 constexpr int kUndistortSteps = 50;
 constexpr double kUndistortStep = 1e-9;
 constexpr double kUndistortedWithin = 1e-4;  // of the focal length
+// Points of a camera whose lens shows nothing at so many of them: the coefficients are those of another model.
+constexpr double kNowhereShare = 0.2;
+// Half the width of the difference that stands for a derivative.
+constexpr double kStretchStepPx = 0.25;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
 
@@ -52,29 +58,63 @@ std::vector<cv::Point2d> undistort(const std::vector<cv::Point2d>& points, const
     return normalized;
 }
 
-Intrinsics guess(const std::vector<cv::Point2d>& points, const cv::Size2d& given, int image) {
+/// As undistort, by the fisheye model: the angle off the axis is found by Newton's method.
+std::vector<cv::Point2d> undistort(const std::vector<cv::Point2d>& points, const cv::Matx33d& K, const Fisheye& lens) {
+    std::vector<cv::Point2d> normalized;
+    for (const cv::Point2d& point : points) {
+        const cv::Point2d seen = normalize_point(point, K);
+        const double radius = cv::norm(seen);
+        double theta = std::min(radius, 0.5 * CV_PI), error = 0.0;
+        for (int step = 0; step < kUndistortSteps; ++step) {
+            const double square = theta * theta;
+            const double series =
+                1.0 + square * (lens.k1 + square * (lens.k2 + square * (lens.k3 + square * lens.k4)));
+            const double slope = 1.0 + square * (3.0 * lens.k1 + square * (5.0 * lens.k2 +
+                                                 square * (7.0 * lens.k3 + square * 9.0 * lens.k4)));
+            error = theta * series - radius;
+            if (std::abs(error) < kUndistortStep) {
+                break;
+            }
+            theta -= error / slope;
+        }
+        const bool reached = std::abs(error) < kUndistortedWithin && theta >= 0.0 && theta < 0.5 * CV_PI;
+        const double scale = radius > 1e-8 ? std::tan(theta) / radius : 1.0;
+        normalized.push_back(reached ? seen * scale : cv::Point2d(kNaN, kNaN));
+    }
+    return normalized;
+}
+
+/// Corner and size of the image that keypoints seem to come from.
+std::pair<cv::Point2d, cv::Size2d> box(const std::vector<cv::Point2d>& points) {
+    constexpr double kInfinity = std::numeric_limits<double>::infinity();
+    cv::Point2d low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
+    for (const cv::Point2d& point : points) {
+        if (std::abs(point.x) < kLargestPx && std::abs(point.y) < kLargestPx) {
+            low = {std::min(low.x, point.x), std::min(low.y, point.y)};
+            high = {std::max(high.x, point.x), std::max(high.y, point.y)};
+        }
+    }
+    if (low.x > high.x) {
+        low = high = {0.0, 0.0};
+    }
+    // Points left of or above the image say that its corner is not the origin: the middle is that of the points.
+    const cv::Point2d corner(low.x < -kOutsideShare * (high.x - low.x) ? low.x : 0.0,
+                             low.y < -kOutsideShare * (high.y - low.y) ? low.y : 0.0);
+    return {corner, {std::max(high.x - corner.x + 1.0, 1.0), std::max(high.y - corner.y + 1.0, 1.0)}};
+}
+
+double longer(const cv::Size2d& size) { return std::max(size.width, size.height); }
+
+/// A usual lens on an image of a size, or of the keypoints' extent; `longer_side` where both images tell it, else 0.
+Intrinsics guess(const std::vector<cv::Point2d>& points, const cv::Size2d& given, int image, double longer_side) {
     cv::Size2d size = given;
     cv::Point2d corner;
     std::string source = "the image size";
     if (given == cv::Size2d()) {
-        constexpr double kInfinity = std::numeric_limits<double>::infinity();
-        cv::Point2d low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
-        for (const cv::Point2d& point : points) {
-            if (std::abs(point.x) < kLargestPx && std::abs(point.y) < kLargestPx) {
-                low = {std::min(low.x, point.x), std::min(low.y, point.y)};
-                high = {std::max(high.x, point.x), std::max(high.y, point.y)};
-            }
-        }
-        if (low.x > high.x) {
-            low = high = {0.0, 0.0};
-        }
-        // Points left of or above the image say that its corner is not the origin: the middle is that of the points.
-        corner.x = low.x < -kOutsideShare * (high.x - low.x) ? low.x : 0.0;
-        corner.y = low.y < -kOutsideShare * (high.y - low.y) ? low.y : 0.0;
-        size = {std::max(high.x - corner.x + 1.0, 1.0), std::max(high.y - corner.y + 1.0, 1.0)};
+        std::tie(corner, size) = box(points);
         source = "the extent of the keypoints";
     }
-    const double focal = kGuessedFocalFactor * std::max(size.width, size.height);
+    const double focal = kGuessedFocalFactor * (longer_side > 0.0 ? longer_side : longer(size));
     Intrinsics intrinsics;
     intrinsics.K = {focal, 0.0,   corner.x + (size.width - 1.0) / 2.0,
                     0.0,   focal, corner.y + (size.height - 1.0) / 2.0,
@@ -113,6 +153,22 @@ std::vector<double> check_distortion(const std::vector<double>& coefficients, co
     return all_zero ? std::vector<double>{} : coefficients;
 }
 
+/// Lens of a camera: coefficients and fisheye.
+void read_lens(const Camera& camera, const char* name, Intrinsics& intrinsics) {
+    intrinsics.distortion = check_distortion(camera.distortion, name);
+    intrinsics.fisheye = camera.fisheye;
+    if (!camera.fisheye) {
+        return;
+    }
+    const Fisheye& lens = *camera.fisheye;
+    if (!camera.distortion.empty()) {
+        throw ArgumentError(std::string(name) + ".distortion: a fisheye has coefficients of its own");
+    }
+    if (!std::isfinite(lens.k1) || !std::isfinite(lens.k2) || !std::isfinite(lens.k3) || !std::isfinite(lens.k4)) {
+        throw ArgumentError(std::string(name) + ".fisheye: expected finite coefficients");
+    }
+}
+
 void check_size(const cv::Size2d& size, const char* name) {
     if (size != cv::Size2d() && (!(size.width >= 1.0) || !(size.height >= 1.0) || !std::isfinite(size.width) ||
                                  !std::isfinite(size.height))) {
@@ -129,7 +185,7 @@ std::vector<cv::Point2d> Intrinsics::normalize(const std::vector<cv::Point2d>& p
         if (!std::isfinite(points[i].x) || !std::isfinite(points[i].y)) {
             continue;
         }
-        if (distortion.empty()) {
+        if (!distorts()) {
             normalized[i] = normalize_point(points[i], K);
         } else {
             rows.push_back(i);
@@ -137,7 +193,8 @@ std::vector<cv::Point2d> Intrinsics::normalize(const std::vector<cv::Point2d>& p
         }
     }
     if (!rows.empty()) {
-        const std::vector<cv::Point2d> undistorted = undistort(finite, K, distortion);
+        const std::vector<cv::Point2d> undistorted =
+            fisheye ? undistort(finite, K, *fisheye) : undistort(finite, K, distortion);
         for (std::size_t k = 0; k < rows.size(); ++k) {
             normalized[rows[k]] = undistorted[k];
         }
@@ -156,24 +213,75 @@ std::pair<Intrinsics, Intrinsics> resolve_intrinsics(const std::vector<cv::Point
         throw ArgumentError("camera1.K: expected a matrix, because camera2 has one");
     }
     for (const auto& [name, camera] : {std::pair{"camera1", &camera1}, std::pair{"camera2", &camera2}}) {
-        if (!camera->distortion.empty() && !camera1.K) {
+        if ((!camera->distortion.empty() || camera->fisheye) && !camera1.K) {
             throw ArgumentError(std::string(name) + ".distortion: distortion coefficients need K");
         }
         check_size(camera->size, name);
     }
     if (!camera1.K) {
-        return {guess(points1, camera1.size, 1), guess(points2, camera2.size, 2)};
+        // Where no size is known, one camera is likelier than two, and the larger extent says more of it.
+        const bool unknown = camera1.size == cv::Size2d() && camera2.size == cv::Size2d();
+        const double shared = unknown ? std::max(longer(box(points1).second), longer(box(points2).second)) : 0.0;
+        return {guess(points1, camera1.size, 1, shared), guess(points2, camera2.size, 2, shared)};
     }
-    Intrinsics first{check_K(*camera1.K, "camera1"), check_distortion(camera1.distortion, "camera1"), false, ""};
+    Intrinsics first, second;
+    first.K = check_K(*camera1.K, "camera1");
+    read_lens(camera1, "camera1", first);
     if (!camera2.K) {
-        Intrinsics second = first;
-        if (!camera2.distortion.empty()) {
-            second.distortion = check_distortion(camera2.distortion, "camera2");
+        second = first;
+        if (!camera2.distortion.empty() || camera2.fisheye) {
+            read_lens(camera2, "camera2", second);
         }
         second.assumption = "both images share K1";
         return {first, second};
     }
-    return {first, {check_K(*camera2.K, "camera2"), check_distortion(camera2.distortion, "camera2"), false, ""}};
+    second.K = check_K(*camera2.K, "camera2");
+    read_lens(camera2, "camera2", second);
+    return {first, second};
+}
+
+std::vector<cv::Matx22d> Intrinsics::stretch(const std::vector<cv::Point2d>& points) const {
+    std::vector<cv::Matx22d> result;
+    if (!distorts()) {
+        return result;
+    }
+    result.resize(points.size());
+    for (int k = 0; k < 2; ++k) {
+        const cv::Point2d step(k == 0 ? kStretchStepPx : 0.0, k == 1 ? kStretchStepPx : 0.0);
+        std::vector<cv::Point2d> after = points, before = points;
+        for (std::size_t i = 0; i < points.size(); ++i) {
+            after[i] += step;
+            before[i] -= step;
+        }
+        after = normalize(after);
+        before = normalize(before);
+        for (std::size_t i = 0; i < points.size(); ++i) {
+            result[i](0, k) = (after[i].x - before[i].x) * K(0, 0) / (2.0 * kStretchStepPx);
+            result[i](1, k) = (after[i].y - before[i].y) * K(1, 1) / (2.0 * kStretchStepPx);
+        }
+    }
+    return result;
+}
+
+std::string lens_doubt(const Intrinsics& camera, const std::vector<cv::Point2d>& points, int image) {
+    std::vector<cv::Point2d> finite;
+    std::copy_if(points.begin(), points.end(), std::back_inserter(finite),
+                 [](const cv::Point2d& point) { return std::isfinite(point.x) && std::isfinite(point.y); });
+    if (!camera.distorts() || finite.empty()) {
+        return "";
+    }
+    const std::vector<cv::Point2d> normalized = camera.normalize(finite);
+    const auto nowhere = std::count_if(normalized.begin(), normalized.end(),
+                                       [](const cv::Point2d& x) { return std::isnan(x.x) || std::isnan(x.y); });
+    const double share = static_cast<double>(nowhere) / static_cast<double>(finite.size());
+    if (share <= kNowhereShare) {
+        return "";
+    }
+    const std::string number = std::to_string(image);
+    const bool plain = !camera.fisheye && camera.distortion.size() == 4;
+    return "dist" + number + " shows nothing at " + std::to_string(std::llround(100.0 * share)) +
+           " % of the keypoints of image " + number +
+           (plain ? "; if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)" : "");
 }
 
 double mean_focal_length(const cv::Matx33d& K1, const cv::Matx33d& K2) {

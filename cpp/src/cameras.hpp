@@ -18,11 +18,18 @@ namespace mgca::detail {
 struct Intrinsics {
     cv::Matx33d K;
     std::vector<double> distortion;  // empty = none
+    std::optional<Fisheye> fisheye;  // in its place
     bool guessed = false;
     std::string assumption;  // one sentence, or empty
 
     /// Pixels to the normalised image plane, distortion removed; NaN where that fails.
     std::vector<cv::Point2d> normalize(const std::vector<cv::Point2d>& points) const;
+
+    /// Derivatives of the undistorted pixels by the pixels, one for each point; none without distortion. NaN where a point
+    /// has no place on the image plane.
+    std::vector<cv::Matx22d> stretch(const std::vector<cv::Point2d>& points) const;
+
+    bool distorts() const { return fisheye.has_value() || !distortion.empty(); }
 
     /// A normalised point to pixels free of distortion.
     cv::Point2d project(double x, double y) const;
@@ -36,6 +43,9 @@ struct Intrinsics {
 std::pair<Intrinsics, Intrinsics> resolve_intrinsics(const std::vector<cv::Point2d>& points1,
                                                      const std::vector<cv::Point2d>& points2, const Camera& camera1,
                                                      const Camera& camera2);
+
+/// One sentence where the lens of a camera shows nothing at many of the keypoints of its image, or an empty one.
+std::string lens_doubt(const Intrinsics& camera, const std::vector<cv::Point2d>& points, int image);
 
 /// Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane.
 double mean_focal_length(const cv::Matx33d& K1, const cv::Matx33d& K2);

@@ -117,12 +117,12 @@ Coefficients Coefficients::read(const Json& values) {
     c.noise_scales = checked(values, "noise_scales", 0);
     c.outlier_width_px = checked(values, "outlier_width_px", 1);
     c.seen_behind = checked(values, "seen_behind", 1);
+    c.support_weight = checked(values, "support_weight", 1);
     c.early_end = checked(values, "early_end", 5);
     c.settled = checked(values, "settled", 3);
     c.verdict = checked(values, "verdict", 2);
     c.confidence = checked(values, "confidence", kFeatureCount + 1);
     c.early_confidence = checked(values, "early_confidence", kEarlyFeatures.size() + 1);
-    c.support_weight = values.has("support_weight") ? checked(values, "support_weight", 1)[0] : 0.0;
     return c;
 }
 
@@ -237,12 +237,10 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         plain.push_back(plain_by_scale[h][column]);
     }
     std::vector<double> merit = likelihood;
-    if (coefficients.support_weight != 0.0) {
-        const std::vector<double> relative = log_relative_support(residuals, weights);
-        const double factor = coefficients.support_weight * std::pow(static_cast<double>(count), 1.5);
-        for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
-            merit[h] += factor * relative[h];
-        }
+    const std::vector<double> relative = log_relative_support(residuals, weights);
+    const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(count), 1.5);
+    for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
+        merit[h] += factor * relative[h];
     }
     const std::size_t chosen = position_of_largest(merit);
     const std::vector<double> support = supports(residuals, weights, 1.0);

@@ -47,8 +47,7 @@ constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);
 /// Coefficients by name, from the model file.
 struct Coefficients {
     std::vector<double> score_trust, noise_px, noise_weights, noise_scales, outlier_width_px, seen_behind, early_end,
-        settled, verdict, confidence, early_confidence;
-    double support_weight = 0.0;  // what relative support counts beside the likelihood; 0 where the file names none
+        support_weight, settled, verdict, confidence, early_confidence;
 
     /// Throws std::invalid_argument where one is missing, or has another length or values.
     static Coefficients read(const Json& values);

@@ -14,16 +14,10 @@ constexpr double kExplainedShare = 0.95, kExplainedThresholdFactor = 2.0, kMaxAc
 constexpr std::size_t kChanceRows = 400;
 constexpr int kTrimRounds = 5;
 constexpr int kModelFreedom = 5;
-
-double median(std::vector<double> values) {
-    const std::size_t half = values.size() / 2;
-    std::nth_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half), values.end());
-    const double upper = values[half];
-    if (values.size() % 2 == 1) {
-        return upper;
-    }
-    return 0.5 * (upper + *std::max_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half)));
-}
+// The median of absolute normal deviates times this is their sigma.
+constexpr double kToSigma = 1.4826;
+// A match this many sigmas off counts no more than that.
+constexpr double kGricCut = 5.0, kPriceOfDimension = 2.2;
 
 Mask within(const std::vector<double>& distances, double limit) {
     Mask near(distances.size());
@@ -139,8 +133,44 @@ cv::Matx33d fit_rotation(const Correspondences& matches, double threshold) {
     return R;
 }
 
+double median(std::vector<double> values) {
+    const std::size_t half = values.size() / 2;
+    std::nth_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half), values.end());
+    const double upper = values[half];
+    if (values.size() % 2 == 1) {
+        return upper;
+    }
+    return 0.5 * (upper + *std::max_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half)));
+}
+
+bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<double>& epipolar_px) {
+    std::vector<double> turned, epipolar;
+    for (std::size_t i = 0; i < rotation_px.size(); ++i) {
+        if (rotation_px[i] < 2.0 * kExplainedThresholdFactor) {
+            turned.push_back(rotation_px[i]);
+            epipolar.push_back(epipolar_px[i]);
+        }
+    }
+    if (turned.empty()) {
+        return false;
+    }
+    const double noise = std::max(kToSigma * median(epipolar), kLeastNoisePx);
+    // Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
+    const auto cost = [noise](const std::vector<double>& distances) {
+        double sum = 0.0;
+        for (const double distance : distances) {
+            sum += std::min(distance * distance / (noise * noise), kGricCut * kGricCut);
+        }
+        return sum;
+    };
+    const auto count = static_cast<double>(turned.size());
+    // Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
+    const double price = kPriceOfDimension * count + 2.0 * std::log(4.0 * count);
+    return cost(turned) - cost(epipolar) < price;
+}
+
 bool explains(const std::vector<double>& distances, double threshold, const Support& support) {
-    const auto count = static_cast<double>(distances.size());
+    const double count = std::min(static_cast<double>(distances.size()), static_cast<double>(support.count));
     // Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
     const double accidents = support.chance_count + 2.0 * std::sqrt(support.chance_count);
     const double wanted = kExplainedShare * (count - std::min(accidents, kMaxAccidentalShare * count));

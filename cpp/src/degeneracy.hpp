@@ -12,6 +12,8 @@ constexpr int kMinSupport = 13;
 // Number of false alarms, log10: above the first the support is chance, above the second it is weak.
 constexpr double kUnrelatedLog10Nfa = 0.5, kLowSupportLog10Nfa = -1.0;
 constexpr double kIntrinsicsSupportFactor = 1.5;
+// Keypoints are not better than this.
+constexpr double kLeastNoisePx = 0.1;
 
 /// How well the fitted matches stand behind the model.
 struct Support {
@@ -35,7 +37,17 @@ std::vector<double> line_distances(const std::vector<cv::Point2d>& points, doubl
 /// Rotation that best aligns the viewing rays of normalised matches (Kabsch), outliers set aside.
 cv::Matx33d fit_rotation(const Correspondences& matches, double threshold);
 
+/// True where a rotation alone is the better model of the inliers than an essential matrix, noise considered: Torr's
+/// criterion GRIC (IJCV 2002).
+///
+/// @param rotation_px distances of the inliers to the rotation's homography. epipolar_px: their Sampson distances to E.
+bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<double>& epipolar_px);
+
+double median(std::vector<double> values);
+
 /// True where a degenerate model explains nearly all inliers, but for those that are there by accident.
+///
+/// @param distances of the inliers to the degenerate model, or of more matches.
 bool explains(const std::vector<double>& distances, double threshold, const Support& support);
 
 }  // namespace mgca::detail

@@ -15,6 +15,9 @@ namespace {
 constexpr double kHomographyConfidence = 0.999;
 constexpr int kHomographyIterations = 1000;
 
+// For F OpenCV's USAC_MAGSAC optimises on larger samples.
+constexpr int kMagsacFundamentalLoSample = 50;
+
 enum class Preset { prosac, magsac, homography };
 
 /// OpenCV's presets USAC_PROSAC and USAC_MAGSAC, which cannot be seeded themselves: with these settings UsacParams gives
@@ -110,8 +113,11 @@ std::optional<cv::Matx33d> fit_epipolar(const Correspondences& rows, double foca
                                              options.max_iterations);
         } else {
             const Preset preset = options.method == Estimator::prosac ? Preset::prosac : Preset::magsac;
-            const cv::UsacParams params =
+            cv::UsacParams params =
                 usac_params(preset, threshold, options.confidence, options.max_iterations, options.seed);
+            if (!calibrated && preset == Preset::magsac) {
+                params.loSampleSize = kMagsacFundamentalLoSample;
+            }
             stacked = calibrated ? cv::findEssentialMat(x1, x2, identity, identity, cv::noArray(), cv::noArray(),
                                                         cv::noArray(), params)
                                  : cv::findFundamentalMat(x1, x2, cv::noArray(), params);
@@ -122,7 +128,8 @@ std::optional<cv::Matx33d> fit_epipolar(const Correspondences& rows, double foca
     return best_of_stack(stacked, unit, ordered, options.threshold_px / focal_px);
 }
 
-std::optional<cv::Matx33d> fit_homography(const Correspondences& rows, double threshold, int seed) {
+std::optional<cv::Matx33d> fit_homography(const Correspondences& rows, double threshold, int seed,
+                                          bool ordered) {
     if (rows.size() < 4) {
         return std::nullopt;
     }
@@ -132,7 +139,7 @@ std::optional<cv::Matx33d> fit_homography(const Correspondences& rows, double th
         const double unit = 1.0 / threshold;
         scaled = cv::findHomography(
             points(rows, 1, unit), points(rows, 2, unit), cv::noArray(),
-            usac_params(Preset::homography, 1.0, kHomographyConfidence, kHomographyIterations, seed));
+            usac_params(ordered ? Preset::prosac : Preset::homography, 1.0, kHomographyConfidence, kHomographyIterations, seed));
     } catch (const cv::Exception&) {
         return std::nullopt;
     }

@@ -33,6 +33,8 @@ std::optional<cv::Matx33d> fit_epipolar(const Correspondences& rows, double foca
 /// Homography with p2 ~ H p1, scaled to H(2, 2) = 1.
 ///
 /// @param threshold transfer error of an inlier, in the unit of the points.
-std::optional<cv::Matx33d> fit_homography(const Correspondences& rows, double threshold, int seed);
+/// @param ordered the most promising points come first, and are drawn first.
+std::optional<cv::Matx33d> fit_homography(const Correspondences& rows, double threshold, int seed,
+                                          bool ordered = false);
 
 }  // namespace mgca::detail

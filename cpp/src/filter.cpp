@@ -1,5 +1,6 @@
 // The public door; the flow of one pair, one call per step, in order; mgca_filter/match_filter.py.
 
+#include "focal_estimate.hpp"
 #include "model_file.hpp"
 #include "network.hpp"
 #include "robust_fit.hpp"
@@ -107,23 +108,34 @@ Filter::Filter(Model model, const Options& options) : model_(std::move(model)), 
 Result Filter::operator()(const MatchPair& matches) const {
     const detail::ModelMetadata& metadata = model_.state_->metadata;
     // 1. Read the pair.
-    const detail::PairInput pair = detail::prepare_pair(matches);
+    detail::PairInput pair = detail::prepare_pair(matches);
+    const bool given = pair.calibrated();
+    if (options_.geometry == Geometry::essential && !given) {
+        throw ArgumentError("camera1.K: the geometry 'essential' needs the intrinsics");
+    }
+    if (options_.geometry == Geometry::fundamental) {
+        pair.intrinsics1.guessed = pair.intrinsics2.guessed = true;
+    }
     Result result;
-    result.intrinsics_guessed = !pair.calibrated();
-    result.assumptions = pair.assumptions;
+    result.intrinsics = given ? IntrinsicsSource::given : IntrinsicsSource::guessed;
 
     // 2. A run on the list alone may explain it.
+    std::optional<detail::Evidence> evidence;
     std::optional<detail::Search> search;
     std::optional<detail::TwoViewModel> model;
     if (options_.method != Method::none) {
-        search.emplace(detail::gather_before(pair), metadata.choice, options_);
-        if (options_.method == Method::automatic && options_.effort == Effort::automatic) {
-            model = search->before_network();
+        evidence = detail::gather_before(pair);
+        if (options_.geometry != Geometry::homography) {
+            search.emplace(*evidence, metadata.choice, options_);
+            if (options_.method == Method::automatic && options_.effort == Effort::automatic) {
+                model = search->before_network();
+            }
         }
     }
 
     // 3. Scores: from the residuals, or by the network, and the fit on what it saw.
     const std::size_t count = pair.valid.size();
+    std::optional<detail::FocalEstimate> focal;
     if (model) {
         result.scores = detail::scores_by_residuals(pair, *model, metadata.choice);
         for (std::size_t i = 0; i < count; ++i) {
@@ -140,30 +152,68 @@ Result Filter::operator()(const MatchPair& matches) const {
             result.scores.push_back(pair.valid[i] != 0 ? metadata.calibration.probability(result.logits[i]) : 0.0F);
             margins.push_back(result.logits[i] - static_cast<float>(metadata.decision_threshold));
         }
+        const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
+        if (evidence) {
+            evidence = detail::gather_scored(pair, sent, result.scores, margins, essential);
+        }
         if (search) {
-            const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
-            model = search->with_network(detail::gather_scored(pair, sent, result.scores, margins, essential));
+            model = search->with_network(*evidence);
+        }
+        if (model && !given && options_.geometry == Geometry::automatic) {
+            // A second fit, of an essential matrix, where the matches tell the focal length that was guessed.
+            focal = detail::estimate_focal(*evidence, model->M);
+        }
+        if (focal) {
+            detail::PairInput zoomed = pair.with_focal(focal->factor);
+            const cv::Matx33d zoom = cv::Matx33d::diag({focal->factor, focal->factor, 1.0});
+            const cv::Matx33d E =
+                detail::usable(essential) ? detail::project_to_essential(zoom * essential * zoom) : essential;
+            detail::Evidence scored = detail::gather_scored(zoomed, sent, result.scores, margins, E);
+            detail::Search again(detail::gather_before(zoomed), metadata.choice, options_);
+            auto better = again.with_network(scored);
+            if (better && detail::agrees_as_well(scored, *better, *evidence, *model)) {
+                pair = std::move(zoomed);
+                evidence = std::move(scored);
+                model = std::move(better);
+            } else {
+                focal.reset();
+            }
         }
     }
 
     // 4. Re-test of all matches, and the verdict.
     detail::Verdict verdict;
-    if (search) {
-        verdict = detail::judge(pair, model, search->evidence(), pair.threshold_px(options_.threshold),
-                                metadata.choice, options_);
-        if (options_.keep_precision && (verdict.F || verdict.R)) {
+    if (!evidence) {
+        verdict = detail::verdict_by_scores(pair, keep_by_scores(pair, result.scores, options_));
+    } else {
+        const double threshold_px = pair.threshold_px(options_.threshold);
+        verdict = options_.geometry == Geometry::homography
+                      ? detail::judge_homography(pair, *evidence, threshold_px, options_)
+                      : detail::judge(pair, model, *evidence, threshold_px, metadata.choice, options_);
+        if (focal && verdict.status == Status::suspicious_intrinsics) {
+            verdict.status = Status::low_support;  // the intrinsics are nobody's claim
+        }
+        if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }
-    } else {
-        verdict = detail::verdict_by_scores(pair, keep_by_scores(pair, result.scores, options_));
     }
     if (model) {
         result.origin = model->origin;
         result.ended = model->ended;
-        if (verdict.R) {
+        if (verdict.t) {
             result.confidence = model->confidence;
         }
     }
+    result.assumptions = pair.assumptions;
+    if (focal) {
+        result.intrinsics = IntrinsicsSource::estimated;
+        result.focal_px = pair.focal_px() / pair.unit_px;
+        result.focal_sigma = focal->sigma;
+        result.assumptions.push_back("focal length " + std::to_string(std::llround(*result.focal_px)) +
+                                     " px of both images estimated from the matches, to " +
+                                     std::to_string(std::llround(100.0 * focal->sigma)) + " %");
+    }
+    result.translation_sigma_deg = verdict.translation_sigma_deg;
     result.status = verdict.status;
     result.mask = std::move(verdict.mask);
     result.num_inliers = static_cast<int>(std::count(result.mask.begin(), result.mask.end(), 1));
@@ -180,12 +230,12 @@ Result Filter::operator()(const MatchPair& matches) const {
 
 Result Filter::operator()(const Keypoints& keypoints1, const Keypoints& keypoints2, const Matches& matches,
                           const Camera& camera1, const Camera& camera2) const {
-    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera1, camera2, {}});
+    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera1, camera2, {}, 1.0});
 }
 
 Result Filter::operator()(const Keypoints& keypoints1, const Keypoints& keypoints2, const Matches& matches,
                           const Camera& camera) const {
-    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera, camera, {}});
+    return (*this)(MatchPair{keypoints1, keypoints2, matches, camera, camera, {}, 1.0});
 }
 
 }  // namespace mgca

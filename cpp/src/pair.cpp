@@ -4,6 +4,7 @@
 #include <cmath>
 #include <optional>
 #include <sstream>
+#include <tuple>
 #include <utility>
 
 namespace mgca::detail {
@@ -160,7 +161,54 @@ std::vector<double> order_of(const Attributes& known, const std::vector<double>&
     return distances.empty() ? std::vector<double>(count, kNaN) : distances;
 }
 
+/// Where the derivative is not known, that of no distortion stands.
+std::vector<cv::Matx22d> stretch_of_matches(const Intrinsics& camera, const std::vector<cv::Point2d>& points,
+                                            const std::vector<int>& index) {
+    std::vector<cv::Matx22d> of_matches;
+    if (!camera.distorts()) {
+        return of_matches;
+    }
+    const std::vector<cv::Matx22d> stretch = camera.stretch(points);
+    for (const int row : index) {
+        cv::Matx22d value = row < 0 ? cv::Matx22d::eye() : stretch[static_cast<std::size_t>(row)];
+        if (!std::all_of(value.val, value.val + 4, [](double x) { return std::isfinite(x); })) {
+            value = cv::Matx22d::eye();
+        }
+        of_matches.push_back(value);
+    }
+    return of_matches;
+}
+
 }  // namespace
+
+PairInput PairInput::with_focal(double factor) const {
+    PairInput zoomed = *this;
+    for (Correspondence& match : zoomed.correspondences) {
+        match /= factor;
+    }
+    for (Intrinsics* camera : {&zoomed.intrinsics1, &zoomed.intrinsics2}) {
+        for (const auto& [row, column] : {std::pair{0, 0}, std::pair{0, 1}, std::pair{1, 1}}) {
+            camera->K(row, column) *= factor;
+        }
+        camera->guessed = false;
+    }
+    return zoomed;
+}
+
+double PairInput::epipolar_distance_px(std::size_t row, const cv::Matx33d& E) const {
+    const Correspondence& match = correspondences[row];
+    const cv::Vec3d line2 = E * ray1(match), line1 = E.t() * ray2(match);
+    cv::Vec2d normal1(line1[0], line1[1]), normal2(line2[0], line2[1]);
+    if (!stretch1.empty()) {
+        normal1 = stretch1[row].t() * normal1;
+    }
+    if (!stretch2.empty()) {
+        normal2 = stretch2[row].t() * normal2;
+    }
+    const double squared_norm = normal1.dot(normal1) + normal2.dot(normal2);
+    return std::abs(ray2(match).dot(line2)) / std::sqrt(std::max(squared_norm, std::numeric_limits<double>::min())) *
+           focal_px();
+}
 
 cv::Matx33d PairInput::fundamental_in_units(const cv::Matx33d& F) const {
     if (unit_px == 1.0) {
@@ -190,14 +238,19 @@ PairInput prepare_pair(const MatchPair& pair) {
     const auto [given1, given2] = resolve_intrinsics(given_points1, given_points2, pair.camera1, pair.camera2);
     check_shared_camera(pair);
 
+    if (!(pair.resolution > 0.0) || !std::isfinite(pair.resolution)) {
+        throw ArgumentError("resolution: expected a number above 0");
+    }
     PairInput input;
     const double size = std::max(extent(given_points1), extent(given_points2));
-    const auto [unit_px, yardstick] = pixels_per_unit(given1, given2, size);
+    const auto [per_unit, yardstick] = pixels_per_unit(given1, given2, size);
+    const bool in_pixels = per_unit == 1.0;
+    const double unit_px = in_pixels ? 1.0 / pair.resolution : per_unit;
     const std::vector<cv::Point2d> points1 = scaled(given_points1, unit_px), points2 = scaled(given_points2, unit_px);
     input.unit_px = unit_px;
     input.intrinsics1 = given1;
     input.intrinsics2 = given2;
-    if (unit_px != 1.0 && given1.guessed) {
+    if (!in_pixels && given1.guessed) {
         std::tie(input.intrinsics1, input.intrinsics2) = resolve_intrinsics(points1, points2, {}, {});
     } else if (unit_px != 1.0) {
         const cv::Matx33d zoom = cv::Matx33d::diag({unit_px, unit_px, 1.0});
@@ -209,9 +262,14 @@ PairInput prepare_pair(const MatchPair& pair) {
             input.assumptions.push_back(camera->assumption);
         }
     }
-    if (unit_px != 1.0) {
-        std::ostringstream sentence;
-        sentence.precision(3);
+    std::ostringstream sentence;
+    sentence.precision(3);
+    if (in_pixels && pair.resolution != 1.0) {
+        sentence << "thresholds are in pixels of the image in which the keypoints were found, " << pair.resolution
+                 << " of K's to one";
+        input.assumptions.push_back(sentence.str());
+    }
+    if (!in_pixels) {
         sentence << "coordinates are no pixels, they extend over " << size
                  << ": thresholds are those of an image in which " << yardstick << " is 1000 pixels";
         input.assumptions.push_back(sentence.str());
@@ -219,7 +277,7 @@ PairInput prepare_pair(const MatchPair& pair) {
     }
     int image = 0;
     for (const auto& [camera, given] :
-         {std::pair{&input.intrinsics1, &pair.camera1}, std::pair{&input.intrinsics2, &pair.camera2}}) {
+         {std::pair{&given1, &pair.camera1}, std::pair{&given2, &pair.camera2}}) {
         ++image;
         const double cx = camera->K(0, 2), cy = camera->K(1, 2);
         const bool inside = cx > 0.0 && cy > 0.0 && cx < given->size.width - 1.0 && cy < given->size.height - 1.0;
@@ -229,9 +287,16 @@ PairInput prepare_pair(const MatchPair& pair) {
                                         ": is it the K of another size?");
         }
     }
+    for (const std::string& doubt : {lens_doubt(given1, given_points1, 1), lens_doubt(given2, given_points2, 2)}) {
+        if (!doubt.empty()) {
+            input.assumptions.push_back(doubt);
+        }
+    }
 
     const Matches& matches = pair.matches;
     const std::size_t count = matches.index1.size();
+    input.stretch1 = stretch_of_matches(input.intrinsics1, points1, matches.index1);
+    input.stretch2 = stretch_of_matches(input.intrinsics2, points2, matches.index2);
     const std::vector<cv::Point2d> normalized1 = input.intrinsics1.normalize(points1);
     const std::vector<cv::Point2d> normalized2 = input.intrinsics2.normalize(points2);
     input.correspondences.assign(count, Correspondence::all(kNaN));

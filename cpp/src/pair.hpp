@@ -22,11 +22,19 @@ struct PairInput {
     std::vector<double> order;  // ascending = promising: the ratio where it is known, else the distance; NaN = neither
     Intrinsics intrinsics1, intrinsics2;
     double unit_px = 1.0;  // pixels to a unit of the caller's coordinates
-    double largest_threshold = std::numeric_limits<double>::infinity();  // one above this is in pixels already
+    double largest_threshold = 0.0;  // one above this is in pixels of the image in which the keypoints were found
     std::vector<std::string> assumptions;
+    // Derivatives of the undistorted pixels by those that were found, one for each match; none without distortion.
+    std::vector<cv::Matx22d> stretch1, stretch2;
 
     bool calibrated() const { return !intrinsics1.guessed; }
     double focal_px() const { return mean_focal_length(intrinsics1.K, intrinsics2.K); }
+
+    /// The pair under the guessed focal length times a factor, taken for the truth from now on.
+    PairInput with_focal(double factor) const;
+
+    /// Sampson distance of a match to E in pixels as they were found: through a lens its derivative counts.
+    double epipolar_distance_px(std::size_t row, const cv::Matx33d& E) const;
 
     /// The caller's threshold in pixels.
     double threshold_px(double threshold) const {

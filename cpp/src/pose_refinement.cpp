@@ -166,6 +166,20 @@ Pose refine_pose(const Correspondences& matches, const Pose& start, double thres
     return pose;
 }
 
+double direction_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise) {
+    if (static_cast<int>(inliers.size()) < kMinRefinedInliers) {
+        return 90.0;
+    }
+    const NormalEquations equations(inliers, pose, std::numeric_limits<double>::infinity());
+    const cv::Matx33d rotation = equations.hessian.get_minor<3, 3>(0, 0) + kSmallestCurvature * cv::Matx33d::eye();
+    const cv::Matx<double, 3, 2> cross = equations.hessian.get_minor<3, 2>(0, 3);
+    const cv::Matx22d marginal =
+        equations.hessian.get_minor<2, 2>(3, 3) - cross.t() * rotation.solve(cross, cv::DECOMP_LU);
+    cv::Matx21d eigenvalues;
+    cv::eigen(marginal, eigenvalues);
+    return std::min(noise / std::sqrt(std::max(eigenvalues(1), 1e-18)) * 180.0 / CV_PI, 90.0);
+}
+
 double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise) {
     if (static_cast<int>(inliers.size()) < kMinRefinedInliers) {
         return 90.0;

@@ -3,6 +3,8 @@
 #include "degeneracy.hpp"
 #include "focal_check.hpp"
 #include "homography.hpp"
+#include "homography_fit.hpp"
+#include "pose_refinement.hpp"
 
 #include <algorithm>
 #include <numeric>
@@ -14,6 +16,8 @@ namespace {
 // The fundamental matrix that may contradict the intrinsics: a run on few, well-chosen matches.
 constexpr double kFundamentalThresholdPx = 1.0;
 constexpr int kFundamentalIterations = 1000;
+// A plane in doubt is looked for quickly first, at a generous threshold.
+constexpr double kQuickPlanePx = 3.0, kPlanePx = 2.0;
 
 Correspondences valid_matches(const PairInput& pair) {
     Correspondences valid;
@@ -92,28 +96,25 @@ bool contradicts_intrinsics(const PairInput& pair, const Correspondences& fitted
 
 /// Whether the model is to be withheld, and whether it is doubtful. The confidence decides; a fundamental matrix, which
 /// has none, must be more than chance.
-std::pair<bool, bool> doubts(const TwoViewModel& model, const Support& support, const Coefficients& coefficients) {
+std::pair<bool, bool> doubts(const TwoViewModel& model, const Support& support, bool weak,
+                             const Coefficients& coefficients) {
     if (model.confidence) {
         return {*model.confidence < coefficients.verdict[0], *model.confidence < coefficients.verdict[1]};
     }
-    const bool few = support.count < kMinSupport || support.log10_nfa > kLowSupportLog10Nfa;
-    return {support.log10_nfa > kUnrelatedLog10Nfa, few};
+    return {support.log10_nfa > kUnrelatedLog10Nfa, weak};
 }
 
 /// The model as it is, with the mask of all matches.
 void keep_model(const PairInput& pair, const TwoViewModel& model, double mask_threshold_px, Verdict& verdict) {
     const cv::Matx33d F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K);
-    const Correspondences valid = valid_matches(pair);
-    std::vector<double> distances;
-    if (pair.calibrated()) {
-        distances = sampson_distances(valid, model.M);
-        for (double& distance : distances) {
-            distance *= pair.focal_px();
+    verdict.mask.assign(pair.valid.size(), 0);
+    for (std::size_t i = 0; i < pair.valid.size(); ++i) {
+        if (pair.valid[i] != 0) {
+            const double distance_px = pair.calibrated() ? pair.epipolar_distance_px(i, model.M)
+                                                         : sampson_distance(pair.pixels(pair.correspondences[i]), F);
+            verdict.mask[i] = distance_px < mask_threshold_px ? 1 : 0;
         }
-    } else {
-        distances = sampson_distances(in_pixels(pair, valid), F);
     }
-    verdict.mask = mask_within(pair, distances, mask_threshold_px);
     verdict.E = model.E;
     verdict.F = pair.fundamental_in_units(F);
     verdict.R = model.pose.R;
@@ -121,34 +122,96 @@ void keep_model(const PairInput& pair, const TwoViewModel& model, double mask_th
     verdict.status = Status::ok;
 }
 
-/// Replace the verdict where a rotation or a plane explains the inliers as well.
-void test_degenerate(const PairInput& pair, const Correspondences& inliers, const Support& support,
-                     double mask_threshold_px, int seed, Verdict& verdict) {
-    const Correspondences pixels = in_pixels(pair, inliers);
+/// A homography of the pixels as the model, with the mask of all matches.
+void keep_homography(const PairInput& pair, const cv::Matx33d& H, Status status, double mask_threshold_px,
+                     Verdict& verdict) {
+    const auto distances = sampson_distances_to_homography(in_pixels(pair, valid_matches(pair)), H);
+    verdict.mask = mask_within(pair, distances, mask_threshold_px);
+    verdict.status = status;
+    verdict.E.reset();
+    verdict.F.reset();
+    verdict.R.reset();
+    verdict.t.reset();
+    verdict.H = pair.homography_in_units(H);
+}
+
+/// Change the verdict and return true where a rotation alone explains as many matches, so that they say nothing of a
+/// translation.
+///
+/// @param fitted what bears witness. inliers: those that agree with the model.
+bool test_rotation(const PairInput& pair, const TwoViewModel& model, const Correspondences& fitted,
+                   const Correspondences& inliers, const Support& support, double mask_threshold_px, Verdict& verdict) {
     const cv::Matx33d R = fit_rotation(inliers, kRefinePx / pair.focal_px());
     const cv::Matx33d H = pair.intrinsics2.K * R * pair.intrinsics1.K.inv();
-    if (explains(homography_distances(pixels, H), kRefinePx, support)) {
-        const auto distances = homography_distances(in_pixels(pair, valid_matches(pair)), H);
-        verdict.status = Status::pure_rotation;
-        verdict.mask = mask_within(pair, distances, mask_threshold_px);
-        verdict.E.reset();
-        verdict.F.reset();
-        verdict.t.reset();
-        verdict.R = R;
-        verdict.H = pair.homography_in_units(H);
+    if (!explains(homography_distances(in_pixels(pair, fitted), H), kRefinePx, support)) {
+        return false;
+    }
+    std::vector<double> epipolar_px = sampson_distances(inliers, model.M);
+    for (double& distance : epipolar_px) {
+        distance *= pair.focal_px();
+    }
+    if (pair.calibrated() && !prefers_rotation(homography_distances(in_pixels(pair, inliers), H), epipolar_px)) {
+        return false;
+    }
+    keep_homography(pair, H, Status::pure_rotation, mask_threshold_px, verdict);
+    verdict.R = R;
+    return true;
+}
+
+HomographyOptions plane_options(const Options& options) {
+    HomographyOptions result;
+    result.threshold = kPlanePx;
+    result.confidence = options.confidence;
+    result.seed = options.seed;
+    return result;
+}
+
+/// The homography of the pixels that the matches support best.
+std::optional<cv::Matx33d> best_homography(const PairInput& pair, const Evidence& evidence, const Options& options) {
+    return estimate_homography(in_pixels(pair, evidence.correspondences), plane_options(options),
+                               evidence.network ? evidence.network->scores : std::vector<double>{});
+}
+
+/// The verdict with the homography that explains the inliers as well, where there is one.
+void test_plane(const PairInput& pair, const Evidence& evidence, const Correspondences& inliers,
+                const Support& support, const Options& options, Verdict& verdict) {
+    const Correspondences pixels = in_pixels(pair, inliers);
+    const auto quick = fit_homography(pixels, kHomographyThresholdFactor * kRefinePx, options.seed);
+    if (!quick || !explains(homography_distances(pixels, *quick), kRefinePx, support)) {
         return;
     }
-    const auto plane = fit_homography(pixels, kHomographyThresholdFactor * kRefinePx, seed);
-    if (plane && explains(homography_distances(pixels, *plane), kRefinePx, support)) {
-        verdict.status = Status::planar;
-        verdict.H = pair.homography_in_units(*plane);
-        if (!pair.calibrated()) {
-            // Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
-            verdict.E.reset();
-            verdict.R.reset();
-            verdict.t.reset();
-        }
+    verdict.status = Status::planar;
+    verdict.H = pair.homography_in_units(best_homography(pair, evidence, options).value_or(*quick));
+    if (!pair.calibrated()) {
+        // Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
+        verdict.E.reset();
+        verdict.R.reset();
+        verdict.t.reset();
     }
+}
+
+/// A plane that explains a pair whose pose is doubtful, more than chance would; else the verdict as it is.
+Verdict plane_or(const Verdict& verdict, const PairInput& pair, const Evidence& evidence, double mask_threshold_px,
+                 const Options& options) {
+    const Correspondences rows = in_pixels(pair, evidence.correspondences);
+    const Correspondences sharp = in_pixels(pair, evidence.take(evidence.accepted()));
+    const auto quick = fit_homography(sharp, kQuickPlanePx, options.seed, true);
+    if (!quick || homography_false_alarms(sharp, *quick, kPlanePx) > kMeaningfulLog10Nfa) {
+        return verdict;
+    }
+    const cv::Matx33d H = best_homography(pair, evidence, options).value_or(*quick);
+    const double log10_nfa = homography_false_alarms(rows, H, kPlanePx);
+    const std::vector<double> distances = sampson_distances_to_homography(sharp, H);
+    const auto agreeing = static_cast<int>(
+        std::count_if(distances.begin(), distances.end(), [](double distance) { return distance < kPlanePx; }));
+    if (log10_nfa > kMeaningfulLog10Nfa || agreeing < kMinSupport) {
+        return verdict;
+    }
+    Verdict plane = verdict;
+    plane.support = agreeing;
+    plane.log10_false_alarms = log10_nfa;
+    keep_homography(pair, H, Status::planar, mask_threshold_px, plane);
+    return plane;
 }
 
 }  // namespace
@@ -173,7 +236,7 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
         near = near_rows(evidence, witnesses, model->M, threshold);
     }
     if (near.size() < kMinMatches) {
-        return verdict;
+        return plane_or(verdict, pair, evidence, mask_threshold_px, options);
     }
     const Correspondences fitted = evidence.take(witnesses), inliers = evidence.take(near);
     const Support support = measure_support(fitted, model->M, threshold);
@@ -182,18 +245,25 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
     }
     verdict.support = support.count;
     verdict.log10_false_alarms = support.log10_nfa;
-    const bool suspicious = contradicts_intrinsics(pair, fitted, support, options);
-    const auto [withheld, doubtful] = doubts(*model, support, coefficients);
-    if (withheld && !suspicious) {
-        verdict.status = Status::unrelated;
+    const bool weak = support.count < kMinSupport || support.log10_nfa > kLowSupportLog10Nfa;
+    if (!weak && test_rotation(pair, *model, fitted, inliers, support, mask_threshold_px, verdict)) {
         return verdict;
     }
+    const bool suspicious = contradicts_intrinsics(pair, fitted, support, options);
+    const auto [withheld, doubtful] = doubts(*model, support, weak, coefficients);
+    if (withheld && !suspicious) {
+        verdict.status = Status::unrelated;
+        return plane_or(verdict, pair, evidence, mask_threshold_px, options);
+    }
+    const double noise = std::max(median(sampson_distances(inliers, model->M)), kLeastNoisePx / pair.focal_px());
+    verdict.translation_sigma_deg = direction_uncertainty_deg(inliers, model->pose, noise);
     keep_model(pair, *model, mask_threshold_px, verdict);
     if (suspicious) {
         verdict.status = Status::suspicious_intrinsics;
         return verdict;
     }
     if (doubtful) {
+        verdict.H = plane_or(verdict, pair, evidence, mask_threshold_px, options).H;
         verdict.status = Status::low_support;
         return verdict;
     }
@@ -204,7 +274,37 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
             return verdict;
         }
     }
-    test_degenerate(pair, inliers, support, mask_threshold_px, options.seed, verdict);
+    test_plane(pair, evidence, inliers, support, options, verdict);
+    return verdict;
+}
+
+Verdict judge_homography(const PairInput& pair, const Evidence& evidence, double mask_threshold_px,
+                         const Options& options) {
+    Verdict verdict;
+    verdict.mask.assign(pair.valid.size(), 0);
+    if (distinct_rows(valid_matches(pair)).size() < 4) {
+        verdict.status = Status::too_few_matches;
+        return verdict;
+    }
+    const auto H = best_homography(pair, evidence, options);
+    if (!H) {
+        return verdict;
+    }
+    // The best by score first: chance is counted on the heads of the list.
+    Rows order(evidence.size());
+    std::iota(order.begin(), order.end(), std::size_t{0});
+    if (evidence.network) {
+        const std::vector<double>& scores = evidence.network->scores;
+        std::stable_sort(order.begin(), order.end(),
+                         [&](std::size_t a, std::size_t b) { return scores[a] > scores[b]; });
+    }
+    const PlaneSupport support = plane_support(in_pixels(pair, evidence.take(order)), *H, kPlanePx);
+    verdict.support = support.count;
+    verdict.log10_false_alarms = support.log10_nfa;
+    verdict.status = Status::unrelated;
+    if (support.log10_nfa < kMeaningfulLog10Nfa) {
+        keep_homography(pair, *H, Status::ok, mask_threshold_px, verdict);
+    }
     return verdict;
 }
 

@@ -19,7 +19,7 @@ struct Verdict {
     std::optional<cv::Vec3d> t;
     std::optional<cv::Matx33d> H;
     std::optional<int> support;
-    std::optional<double> log10_false_alarms, focal_factor;
+    std::optional<double> log10_false_alarms, focal_factor, translation_sigma_deg;
 };
 
 /// Re-test all matches against the model and decide what it is worth.
@@ -27,6 +27,10 @@ struct Verdict {
 /// @param evidence what the model was fitted to; what the network accepts bears witness.
 Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, const Evidence& evidence,
               double mask_threshold_px, const Coefficients& coefficients, const Options& options);
+
+/// The answer where the caller asks for a homography: the one that the matches support best, if it is no chance.
+Verdict judge_homography(const PairInput& pair, const Evidence& evidence, double mask_threshold_px,
+                         const Options& options);
 
 /// Answer without a robust fit: the mask is the network's opinion, and there is no geometry to judge.
 Verdict verdict_by_scores(const PairInput& pair, Mask kept);

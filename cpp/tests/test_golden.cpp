@@ -51,7 +51,10 @@ public:
 
 private:
     void facts() const {
-        check::equal(result_.intrinsics_guessed, expected_["intrinsics"].text() == "guessed", name_ + ": intrinsics");
+        const std::string source = result_.intrinsics == mgca::IntrinsicsSource::given       ? "given"
+                                   : result_.intrinsics == mgca::IntrinsicsSource::estimated ? "estimated"
+                                                                                             : "guessed";
+        check::equal(source, expected_["intrinsics"].text(), name_ + ": intrinsics");
         const std::vector<Json>& assumptions = expected_["assumptions"].items();
         if (check::equal(result_.assumptions.size(), assumptions.size(), name_ + ": assumptions")) {
             for (std::size_t i = 0; i < assumptions.size(); ++i) {
@@ -106,7 +109,7 @@ private:
             return check::equal(given, expected_.has(name), name_ + ": " + name + " is given") && given;
         };
         // What is guessed is compared by its mask: F is not refined, and the pose is none to speak of.
-        const bool tight = exact_ || !result_.intrinsics_guessed;
+        const bool tight = exact_ || result_.intrinsics == mgca::IntrinsicsSource::given;
         const double radians = kPoseDeg * CV_PI / 180.0;
         if (there("R", result_.R.has_value()) && tight) {
             check::near(rotation_error_deg(*result_.R, golden::matrix(expected_["R"])), 0.0, kPoseDeg, name_ + ": R");

@@ -183,7 +183,7 @@ void options_are_felt(const Model& model, const MatchPair& pair) {
 void cameras_are_felt(const Model& model, const MatchPair& pair) {
     const Filter filter(model);
     const Result guessed = filter(pair.keypoints1, pair.keypoints2, pair.matches);
-    check::that(guessed.intrinsics_guessed && !guessed.confidence, "without K it is guessed");
+    check::that(guessed.intrinsics != mgca::IntrinsicsSource::given, "without K it is guessed");
     const Result by_size = filter(pair.keypoints1, pair.keypoints2, pair.matches, Camera(cv::Size2d(2000, 1000)));
     check::that(by_size.assumptions != guessed.assumptions, "the size helps the guess");
     Camera bent = pair.camera1;

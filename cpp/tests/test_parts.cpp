@@ -204,7 +204,7 @@ Coefficients coefficients() {
     return Coefficients::read(Json::parse(R"({
         "score_trust": [0.8, 0.5, 0.05], "noise_px": [0.25, 0.6, 1.5], "noise_weights": [0.4, 0.4, 0.2],
         "noise_scales": [1.0, 1.7], "outlier_width_px": [300], "seen_behind": [0.02],
-        "early_end": [0.5, 50, 0.03, 0.5, 20], "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
+        "support_weight": [0.1], "early_end": [0.5, 50, 0.03, 0.5, 20], "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
         "confidence": [1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0], "early_confidence": [0,0,0,0,0,0,1]})"));
 }
 
@@ -226,7 +226,7 @@ void the_likelier_hypothesis_is_chosen() {
     // Confidence is the logistic function of the weighted features.
     check::near(confidence(judged, c), 1.0 / (1.0 + std::exp(-judged[Feature::log_count])), 1e-12, "confidence");
     check::near(early_confidence(judged, c), 1.0 / (1.0 + std::exp(-1.0)), 1e-12, "early confidence");
-    c.support_weight = -1e3;  // relative support against itself: the worst supported one wins
+    c.support_weight = {-1e3};  // relative support against itself: the worst supported one wins
     check::equal(judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
                  "support_weight is felt");
     check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse("{}")); }, "score_trust is missing");

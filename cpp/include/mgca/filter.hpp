@@ -77,6 +77,14 @@ enum class Method { automatic, prosac, magsac, ransac, none };
 /// Automatic leaves the network out where a run on the list alone explains it; full always runs it.
 enum class Effort { automatic, full };
 
+/// Automatic: an essential matrix where intrinsics are given, else a fundamental matrix, and a homography beside or
+/// instead of it where that explains the pair. Essential demands the intrinsics; fundamental does not let them constrain
+/// the model; homography fits one and no more.
+enum class Geometry { automatic, essential, fundamental, homography };
+
+/// Where the intrinsics of an answer come from.
+enum class IntrinsicsSource { given, estimated, guessed };
+
 /// Settings of the filter.
 struct Options {
     double threshold = 1.0;                ///< Inlier threshold of the mask: Sampson distance, pixels.
@@ -84,6 +92,7 @@ struct Options {
     double confidence = 0.999;             ///< Of the robust fit, in (0, 1).
     Method method = Method::automatic;     ///< Robust fit.
     Effort effort = Effort::automatic;     ///< Whether easy pairs may go without the network.
+    Geometry geometry = Geometry::automatic;  ///< Model that is asked for.
     int max_iterations = 5000;             ///< Largest number of samples that one run of an estimator draws.
     int seed = 0;                          ///< Of every random choice, not negative; same seed, same answer.
 };
@@ -151,6 +160,11 @@ struct MGCA_API Matches {
     std::vector<double> second_distances;            ///< Of the second candidates; likewise.
 };
 
+/// Distortion of OpenCV's fisheye model (cv::fisheye).
+struct Fisheye {
+    double k1 = 0.0, k2 = 0.0, k3 = 0.0, k4 = 0.0;
+};
+
 /// Camera of one image. Everything may be unknown: without K the focal length is guessed and F is the model to trust.
 struct Camera {
     Camera() = default;
@@ -160,7 +174,8 @@ struct Camera {
     explicit Camera(cv::Size2d image_size) : size(image_size) {}
 
     std::optional<cv::Matx33d> K;    ///< [[fx, s, cx], [0, fy, cy], [0, 0, 1]], pixels.
-    std::vector<double> distortion;  ///< OpenCV's coefficients (4, 5, 8, 12 or 14) or none.
+    std::vector<double> distortion;  ///< OpenCV's coefficients (4, 5, 8, 12 or 14) of the pinhole model, or none.
+    std::optional<Fisheye> fisheye;  ///< In place of them: the lens is a fisheye.
     cv::Size2d size;                 ///< Width and height in pixels, or zeros; helps the guess of missing intrinsics.
 };
 
@@ -179,6 +194,9 @@ struct MatchPair {
     Matches matches;
     Camera camera1, camera2;  ///< A second camera without K has that of the first.
     Attributes attributes;
+    /// Pixels of the original per pixel of the image in which the keypoints were found, where they were found in a smaller
+    /// copy; thresholds are then those of the copy.
+    double resolution = 1.0;
 };
 
 /// Answer for M matches; vectors have one entry for each match, in the order of the input.
@@ -194,15 +212,18 @@ struct Result {
     std::optional<cv::Matx33d> F;  ///< Fundamental matrix of unit Frobenius norm, likewise.
     std::optional<cv::Matx33d> R;  ///< Rotation.
     std::optional<cv::Vec3d> t;    ///< Translation of unit length.
-    std::optional<cv::Matx33d> H;  ///< Homography that explains the pair (planar, pure_rotation), H(2, 2) = 1.
+    std::optional<cv::Matx33d> H;  ///< Homography that explains the pair, or was asked for; H(2, 2) = 1.
 
-    bool intrinsics_guessed = false;            ///< The caller gave no K.
+    IntrinsicsSource intrinsics = IntrinsicsSource::given;
+    std::optional<double> focal_px;             ///< Estimated focal length, pixels, and its relative standard deviation.
+    std::optional<double> focal_sigma;
     std::vector<std::string> assumptions;       ///< Sentences on what was assumed.
     int num_network_matches = 0;                ///< Matches that entered the network; 0 where it was not needed.
     std::string origin;                         ///< Source that proposed the model: "list", "network", "accepted", ...
     std::string ended;                          ///< "before the network", "first sources" or "all sources".
     std::optional<int> support;                 ///< Accepted matches that agree with the model.
     std::optional<double> log10_false_alarms;   ///< How many models chance would support as well.
+    std::optional<double> translation_sigma_deg;  ///< Standard deviation of the direction of translation.
     std::optional<double> focal_factor;         ///< The matches ask for focal lengths this many times those given.
 
     /// The geometry may be used as it is.
