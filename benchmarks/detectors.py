@@ -22,7 +22,7 @@ from mgca_filter.data.source import Image, check_folder, match_views, read_image
 from mgca_filter.evaluation.metrics import POSE_STATISTICS, FloatArray
 from mgca_filter.evaluation.predict import evaluate_pair
 from mgca_filter.evaluation.registry import parse_method
-from mgca_filter.features import create_detector, describe
+from mgca_filter.features import Detector, create_detector, describe
 from mgca_filter.tables import markdown_head, markdown_row
 from mgca_filter.training.worlds.photographs import PhotoFolder
 from mgca_filter.training.worlds.view_pairs import match_views as match_rendered
@@ -55,7 +55,7 @@ class ImageSet:
     intrinsics: dict[str, Array]
     pairs: tuple[KnownPair, ...]
 
-    def matched(self, detector: cv2.Feature2D) -> list[ScenePair]:
+    def matched(self, detector: Detector) -> list[ScenePair]:
         """All pairs with what a detector finds and nearest neighbours make of it, no test applied."""
         views = {
             name: replace(describe(image, detector, name), K=self.intrinsics[name])
@@ -145,7 +145,7 @@ KINDS = (
 )
 
 
-def make_detector(name: str) -> cv2.Feature2D:
+def make_detector(name: str) -> Detector:
     """SIFT, ORB or AKAZE as the package makes them, or BRISK with OpenCV's defaults."""
     if name != "brisk":
         return create_detector(name)

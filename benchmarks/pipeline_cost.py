@@ -42,7 +42,8 @@ def run_folder(images: Path, name: str, *words: str) -> Measurement:
     """Run the command on all pairs of the folder."""
     output = images.parent / f"{len(list(images.parent.glob('*.jsonl')))}.jsonl"
     cache = images.parent / "cache"
-    options = ["--K", "512,512,319.5,239.5", "--cache", str(cache), *words]
+    features = ["--detector", "sift", "--max-keypoints", "2000", "--cache", str(cache)]
+    options = ["--K", "512,512,319.5,239.5", *features, *words]
     command = [sys.executable, "-m", "mgca_filter", "folder", str(images), "-o", str(output), *options]
     # Ray's workers give way to everything else (niceness 15) unless told otherwise: no fair race on a busy machine.
     ray = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}

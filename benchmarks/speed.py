@@ -107,7 +107,7 @@ def example_pair() -> RawPair:
     truth = json.loads((EXAMPLES / "pair.json").read_text())
     K1, K2 = np.array(truth["K1"]), np.array(truth["K2"])
     image1, image2 = (read_image(EXAMPLES / truth[name]) for name in ("image1", "image2"))
-    matched = match_images(image1, image2, K1=K1, K2=K2)
+    matched = match_images(image1, image2, detector="sift", max_keypoints=2000, K1=K1, K2=K2)
     points1 = np.array([matched.keypoints1[row[0].queryIdx].pt for row in matched.matches])
     points2 = np.array([matched.keypoints2[row[0].trainIdx].pt for row in matched.matches])
     arguments = (matched.keypoints1, matched.keypoints2, matched.matches)

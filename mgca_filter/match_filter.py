@@ -200,6 +200,8 @@ class MatchFilter:
                 verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
             if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
                 verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
+            if job.focal is not None and verdict.status is Status.PLANAR:
+                verdict = replace(verdict, E=None, R=None, t=None)  # a plane tells no focal length
             found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
             if self.options.keep_precision is not None and found:
                 verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
@@ -327,7 +329,7 @@ class _Job:
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:
-        """The network's own E (3, 3), where it was asked."""
+        """The network E (3, 3), where it was asked."""
         return None if self.output is None else self.output.essential
 
 

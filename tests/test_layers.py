@@ -44,7 +44,7 @@ def rooms() -> dict[Path, str]:
 
 
 def imported(path: Path) -> set[tuple[str, ...]]:
-    """What a module imports of the package, wherever in its text: ``from ..fit.ranking import f`` is ("fit", "ranking",
+    """What a module imports of the package, wherever in its text: ``from ..fit.choice import f`` is ("fit", "choice",
     "f"). Imports for type checkers alone count like any other."""
     package = path.relative_to(PACKAGE).parts[:-1]
     found: set[tuple[str, ...]] = set()
@@ -88,7 +88,7 @@ def test_an_upward_and_a_sideways_arrow_are_seen(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr("test_layers.PACKAGE", tmp_path)
     (tmp_path / "geometry").mkdir()
     upward, sideways = tmp_path / "geometry" / "epipolar.py", tmp_path / "drawing.py"
-    upward.write_text("def f():\n    from ..fit.ranking import RankedMatches\n")
+    upward.write_text("def f():\n    from ..fit.evidence import Evidence\n")
     sideways.write_text("from .errors import MgcaFilterError\nfrom .network import MGCANet\n")
-    assert wrong_arrows(upward, "geometry") == ["geometry/epipolar.py imports fit.ranking.RankedMatches"]
+    assert wrong_arrows(upward, "geometry") == ["geometry/epipolar.py imports fit.evidence.Evidence"]
     assert wrong_arrows(sideways, "drawing") == ["drawing.py imports network.MGCANet"]

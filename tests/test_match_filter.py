@@ -34,8 +34,9 @@ def assert_same(one: FilterResult, other: FilterResult) -> None:
 def test_three_positional_arguments_are_enough(scene: Scene, model_file: Path) -> None:
     result = filter_matches(*scene.keypoints(), scene.knn_matches(), model=model_file)
     assert result.status is Status.OK
-    assert result.info["intrinsics"] == "guessed"
-    assert len(result.info["assumptions"]) == 2
+    assert result.info["intrinsics"] == "estimated"
+    assert 0.25 * K[0, 0] < result.info["focal_px"] < 4.0 * K[0, 0]
+    assert len(result.info["assumptions"]) == 3
     assert np.mean(result.mask == scene.inlier) > 0.95
 
 
@@ -351,7 +352,7 @@ def photographs() -> tuple[np.ndarray, np.ndarray]:
     return image, cv2.warpPerspective(image, H, (1500, 1200))
 
 
-@pytest.mark.parametrize("detector", ["sift", "orb", cv2.SIFT.create(nfeatures=500)])
+@pytest.mark.parametrize("detector", ["sift", "rootsift", "orb", "brisk", cv2.SIFT.create(nfeatures=500)])
 def test_match_images_in_pixels_of_the_originals(
     photographs: tuple[np.ndarray, np.ndarray], detector: object, model_file: Path
 ) -> None:
@@ -366,6 +367,35 @@ def test_match_images_in_pixels_of_the_originals(
     distance = np.linalg.norm(cv2.perspectiveTransform(source, H)[0] - target, axis=1)
     assert np.median(distance) < 1.5
     assert found.result.info["assumptions"][0].endswith("guessed from the image size")
+
+
+def test_match_images_finds_4000_rootsift_keypoints_unless_told_otherwise(
+    photographs: tuple[np.ndarray, np.ndarray], model_file: Path
+) -> None:
+    default = mgca_filter.match_images(*photographs, model=model_file)
+    named = mgca_filter.match_images(*photographs, detector="rootsift", max_keypoints=4000, model=model_file)
+    plain = mgca_filter.match_images(*photographs, detector="sift", max_keypoints=4000, model=model_file)
+    few = mgca_filter.match_images(*photographs, max_keypoints=100, model=model_file)
+
+    def distances(found: mgca_filter.ImageMatchResult) -> list[float]:
+        return [row[0].distance for row in found.matches]
+
+    assert distances(default) == distances(named)
+    assert max(distances(default)) < 2**0.5 < max(distances(plain))
+    assert len(few.keypoints1) <= 101 < len(default.keypoints1) <= 4001
+
+
+def test_match_images_with_a_matcher_of_opencv(photographs: tuple[np.ndarray, np.ndarray], model_file: Path) -> None:
+    options = {"max_keypoints": 500, "model": model_file}
+    plain = mgca_filter.match_images(*photographs, **options)
+    crossed = mgca_filter.match_images(*photographs, matcher=cv2.BFMatcher(crossCheck=True), **options)
+    flann = mgca_filter.match_images(*photographs, matcher=cv2.FlannBasedMatcher(), **options)
+    assert len(crossed.matches) < len(plain.matches) == len(flann.matches)
+    for found in (crossed, flann):
+        assert len(found.matches) == len(found.result.mask)
+        assert found.result.status in (Status.PLANAR, Status.PURE_ROTATION)
+    with pytest.raises(TypeError, match="matcher: expected a cv2.DescriptorMatcher or None, got str"):
+        mgca_filter.match_images(*photographs, matcher="flann", **options)
 
 
 def test_match_images_of_blank_images(model_file: Path) -> None:
@@ -437,8 +467,9 @@ def test_every_other_list_is(match_filter: MatchFilter, asked: list[int], scene:
 def test_without_intrinsics_every_list_is(match_filter: MatchFilter, asked: list[int]) -> None:
     result = match_filter.filter(EASY.points1, EASY.points2, None, attributes=EASY.attributes)
     assert len(asked) == 1
-    assert result.info["ended"] == "all sources"
-    assert result.confidence is None
+    assert result.info["ended"] != "before the network"
+    assert result.info["intrinsics"] == "estimated"
+    assert result.confidence > 0.5
 
 
 def test_in_a_batch_only_the_hard_ones_are(match_filter: MatchFilter, asked: list[int]) -> None:

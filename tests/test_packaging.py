@@ -51,6 +51,7 @@ def wheel(tmp_path_factory) -> Path:
 def test_wheel_holds_the_model_its_card_and_the_type_marker(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert "mgca_filter/py.typed" in names
+    assert "mgca_filter/fit/choice.json" in names
     assert any(name.startswith("mgca_filter/models/") and name.endswith(".onnx") for name in names)
     assert any(name.startswith("mgca_filter/models/") and name.endswith(".md") for name in names)
     assert any(name.endswith("LICENSE") for name in names)

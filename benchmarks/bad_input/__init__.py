@@ -1,1 +1,1 @@
-"""Bad input into every entry point: ``matches`` and ``files`` make it, ``promises`` says what must hold."""
+"""Bad input into every entry point: ``matches``, ``files``, ``databases`` make it, ``promises`` says what must hold."""

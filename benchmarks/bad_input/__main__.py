@@ -1,7 +1,8 @@
 """Every kind of bad input into every entry point: ``python -m benchmarks.bad_input`` prints what was tried.
 
-Entry points: ``filter_matches`` with intrinsics and without, the twins of ``cv2.findEssentialMat`` and
-``cv2.findFundamentalMat``, ``matchMGCA``, and ``mgca-match`` on image files that are broken in all ways.
+Entry points: ``filter_matches`` with intrinsics, without, and where the program has numpy raise; the twins of
+``cv2.findEssentialMat`` and ``cv2.findFundamentalMat``; ``matchMGCA``; and ``mgca-match`` on image files and COLMAP
+databases that are broken in all ways.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from mgca_filter.opencv.twins import findEssentialMat, findFundamentalMat, match
 from mgca_filter.tables import render_table
 
 from ..study import run_study
+from .databases import DATABASES, damage, write_good_database
 from .files import FILES
 from .matches import FORMS, HEIGHT, KINDS, WIDTH, K
 from .promises import broken_promises, broken_twin_answer
@@ -57,6 +59,14 @@ def try_pairs(match_filter: MatchFilter, rounds: int, seed: int) -> Iterator[Tri
             for entry, call in entry_points(match_filter).items():
                 label = f"{kind}, {len(first)} matches as {form}"
                 yield Trial(kind, entry, _failure(partial(call, *arguments), label))
+            strict = partial(_with_strict_numpy, entry_points(match_filter)["filter, K given"])
+            yield Trial(kind, "filter, numpy raises", _failure(partial(strict, *arguments), label))
+
+
+def _with_strict_numpy(call: Callable[[Any, Any, Any], list[str]], *arguments: Any) -> list[str]:
+    """As in a program that says ``np.seterr(all="raise")``."""
+    with np.errstate(all="raise"):
+        return call(*arguments)
 
 
 def entry_points(match_filter: MatchFilter) -> dict[str, Callable[[Any, Any, Any], list[str]]]:
@@ -64,7 +74,7 @@ def entry_points(match_filter: MatchFilter) -> dict[str, Callable[[Any, Any, Any
 
     def by_filter(K1: Any) -> Callable[[Any, Any, Any], list[str]]:
         return lambda kp1, kp2, m: broken_promises(
-            match_filter.filter(kp1, kp2, m, K1=K1), len(kp1) if m is None else len(m)
+            match_filter.filter(kp1, kp2, m, K1=K1), len(_pixels(kp1)) if m is None else len(m)
         )
 
     def by_twin(kp1: Any, kp2: Any, essential: bool) -> list[str]:
@@ -73,8 +83,8 @@ def entry_points(match_filter: MatchFilter) -> dict[str, Callable[[Any, Any, Any
         return broken_twin_answer(answer, len(points1), essential)
 
     def by_gms(kp1: Any, kp2: Any, matches: Any) -> list[str]:
-        rows = [cv2.DMatch(i, i, 0.0) for i in range(len(kp1))] if matches is None else matches
-        if isinstance(rows, np.ndarray):
+        rows = [cv2.DMatch(i, i, 0.0) for i in range(len(_pixels(kp1)))] if matches is None else matches
+        if isinstance(rows, np.ndarray) and rows.dtype != object:
             rows = [cv2.DMatch(int(i), int(j), 0.0) for i, j in rows]
         kept = matchMGCA(_SIZE, _SIZE, kp1, kp2, rows)
         return [] if isinstance(kept, tuple) and all(isinstance(m, cv2.DMatch) for m in kept) else ["no DMatch tuple"]
@@ -89,7 +99,7 @@ def entry_points(match_filter: MatchFilter) -> dict[str, Callable[[Any, Any, Any
 
 
 def _pixels(keypoints: Any) -> Any:
-    if isinstance(keypoints, list) and keypoints and isinstance(keypoints[0], cv2.KeyPoint):
+    if len(keypoints) and isinstance(keypoints[0], cv2.KeyPoint):
         return np.array([keypoint.pt for keypoint in keypoints])
     return np.asarray(keypoints, dtype=np.float64).reshape(-1, 2)
 
@@ -114,6 +124,30 @@ def try_files(model: Path) -> Iterator[Trial]:
                 return [*wrong, "no line that names the file"] if unnamed else wrong
 
             yield Trial(f"file: {kind}", "mgca-match", _failure(call, kind))
+
+
+def try_databases(model: Path) -> Iterator[Trial]:
+    """``mgca-match colmap`` on every kind of database: an exit status that is right, never a traceback."""
+    try:
+        import pycolmap  # noqa: F401
+    except ImportError:
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (kind, (statement, statuses)) in enumerate(DATABASES.items()):
+            path = Path(folder) / f"{number}.db"
+            write_good_database(path)
+            damage(path, statement)
+
+            def call(path: Path = path, statuses: Sequence[int] = statuses) -> list[str]:
+                out = io.StringIO()
+                words = [str(path), "-o", str(path) + ".out.db", "-q", "--model", str(model)]
+                with contextlib.redirect_stderr(out), contextlib.redirect_stdout(io.StringIO()):
+                    status = cli.main(["colmap", *words])
+                unnamed = status == 2 and (path.name not in out.getvalue() or out.getvalue().count("\n") != 1)
+                wrong = [] if status in statuses else [f"exit status {status}: {out.getvalue().strip()}"]
+                return [*wrong, "no line that names the file"] if unnamed else wrong
+
+            yield Trial(f"database: {kind}", "mgca-match colmap", _failure(call, kind))
 
 
 def _failure(call: Callable[[], list[str]], label: str) -> str:
@@ -154,6 +188,7 @@ def run(options: argparse.Namespace) -> int:
     """Try everything and print the table."""
     match_filter = MatchFilter(model=options.model, method=options.method)
     trials = [*try_pairs(match_filter, options.rounds, options.seed), *try_files(options.model)]
+    trials += try_databases(options.model)
     print(format_table(trials))
     for trial in trials:
         if trial.failure:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -33,6 +34,31 @@ def _one_pixel(path: Path, good: bytes) -> None:
 
 def _sixteen_bits(path: Path, good: bytes) -> None:
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 65536, (90, 120), dtype=np.uint16))
+
+
+def _grey(encoded: bytes) -> NDArray[np.uint8]:
+    return np.asarray(cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+
+
+def _thermal(path: Path, good: bytes) -> None:
+    """16 bits of which the scene uses a thousand counts."""
+    cv2.imwrite(str(path), _grey(good).astype(np.uint16) * 4 + 7000)
+
+
+def _with_segment(content: bytes) -> Callable[[Path, bytes], object]:
+    """The good picture as JPEG with an EXIF segment of some bytes."""
+
+    def write(path: Path, good: bytes) -> object:
+        jpeg = cv2.imencode(".jpg", _grey(good), [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
+        segment = b"Exif\0\0" + content
+        return path.write_bytes(jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:])
+
+    return write
+
+
+_GARBAGE = np.random.default_rng(2).integers(0, 256, 3000, dtype=np.uint8).tobytes()
+_TURNS_IN_CIRCLES = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x8769, 4, 1, 8)
+_ABSURD_FOCAL_LENGTH = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0xA405, 3, 1, 65_535, 0, 0)
 
 
 def _with_alpha(path: Path, good: bytes) -> None:
@@ -60,6 +86,12 @@ FILES: dict[str, tuple[Callable[[Path, bytes], object], tuple[int, ...]]] = {
     "one pixel": (_one_pixel, (1,)),
     "noise": (_noise, (1,)),
     "16 bits": (_sixteen_bits, (1,)),
+    "16 bits, few of them used": (_thermal, (0,)),
+    "EXIF: empty": (_with_segment(b""), (0,)),
+    "EXIF: garbage": (_with_segment(_GARBAGE), (0,)),
+    "EXIF: garbage behind a header": (_with_segment(b"MM\0*\0\0\0\10" + _GARBAGE), (0,)),
+    "EXIF: points to itself": (_with_segment(_TURNS_IN_CIRCLES), (0,)),
+    "EXIF: focal length 65 m": (_with_segment(_ABSURD_FOCAL_LENGTH), (0,)),
     "with alpha": (_with_alpha, (1,)),
     "the same image twice": (lambda path, good: path.write_bytes(good), (0,)),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -89,6 +90,18 @@ def _tiny(rng: Generator, count: int) -> Points:
     return first * 1e-12, second * 1e-12
 
 
+def _normalised(rng: Generator, count: int) -> Points:
+    """What ``cv2.undistortPoints`` gives: no pixels."""
+    first, second = _half_wrong(rng, count)
+    return (first - K[:2, 2]) / K[0, 0], (second - K[:2, 2]) / K[0, 0]
+
+
+def _millimetres(rng: Generator, count: int) -> Points:
+    """On the sensor, behind a lens of 12 mm."""
+    first, second = _normalised(rng, count)
+    return 12.0 * first, 12.0 * second
+
+
 def _unusable(rng: Generator, count: int) -> Points:
     value = rng.choice([np.nan, np.inf, -np.inf])
     return np.full((count, 2), value), np.full((count, 2), value)
@@ -119,6 +132,8 @@ KINDS: dict[str, Callable[[Generator, int], Points]] = {
     "duplicated matches": _duplicated,
     "huge coordinates": _huge,
     "tiny coordinates": _tiny,
+    "normalised": _normalised,
+    "millimetres": _millimetres,
     "NaN or infinite": _unusable,
     "mixture": _mixture,
 }
@@ -150,6 +165,27 @@ def _as_index_pairs(first: Array, second: Array, rng: Generator) -> tuple[Any, A
     return first, second, np.stack([rows, rows], axis=1).astype(str(rng.choice(["int32", "int64", "uint16"])))
 
 
+def _in_object_arrays(first: Array, second: Array, rng: Generator) -> tuple[Any, Any, Any]:
+    """As ``np.array(matches)[mask]`` leaves them."""
+    keypoints1, keypoints2, matches = _as_dmatches(first, second, rng)
+    return _object_array(keypoints1), _object_array(keypoints2), _object_array(matches)
+
+
+def _object_array(items: list[Any]) -> NDArray[np.object_]:
+    array = np.empty(len(items), dtype=object)
+    array[:] = items
+    return array
+
+
+def _in_tuples_and_queues(first: Array, second: Array, rng: Generator) -> tuple[Any, Any, Any]:
+    keypoints1, keypoints2, matches = _as_dmatches(first, second, rng)
+    return tuple(keypoints1), deque(keypoints2), deque(matches)
+
+
+def _one_by_two(first: Array, second: Array, rng: Generator) -> tuple[Any, Any, Any]:
+    return first[None], second[None], None
+
+
 FORMS: dict[str, Callable[[Array, Array, Generator], tuple[Any, Any, Any]]] = {
     "arrays": lambda first, second, rng: (first, second, None),
     "float32": lambda first, second, rng: (_float32(first)[:, None], _float32(second)[:, None], None),
@@ -157,6 +193,9 @@ FORMS: dict[str, Callable[[Array, Array, Generator], tuple[Any, Any, Any]]] = {
     "index pairs": _as_index_pairs,
     "DMatch": _as_dmatches,
     "knnMatch": _as_knn,
+    "object arrays": _in_object_arrays,
+    "tuples and queues": _in_tuples_and_queues,
+    "(1, N, 2)": _one_by_two,
 }
 """The types that callers pass: pixels in, ``(kp1, kp2, matches)`` out."""
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..features import DEFAULT_DETECTOR, DEFAULT_FEATURE_COUNT, DETECTORS
 from ..inputs.options import EFFORTS, GEOMETRIES, METHODS, FilterOptions
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
@@ -33,6 +34,18 @@ class OneLineParser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         """Raise UsageError."""
         raise UsageError(f"{message} (see {self.prog} --help)")
+
+
+def add_detector_options(parser: Any) -> None:
+    """``--detector`` and ``--max-keypoints``, for a parser or a group of its options."""
+    parser.add_argument("--detector", choices=DETECTORS, default=DEFAULT_DETECTOR, help=f"default {DEFAULT_DETECTOR}")
+    parser.add_argument(
+        "--max-keypoints",
+        metavar="N",
+        type=positive(int),
+        default=DEFAULT_FEATURE_COUNT,
+        help=f"of an image, default {DEFAULT_FEATURE_COUNT}",
+    )
 
 
 def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = False) -> None:

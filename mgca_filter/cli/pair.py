@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from .. import __version__
 from ..errors import MgcaFilterError
 from ..exif import exif_intrinsics
-from ..features import DETECTORS, detector_resolution
+from ..features import detector_resolution
 from ..images import decode_image, principal_point_doubt
 from ..match_images import match_images
 from ..result import Status
@@ -27,11 +27,11 @@ from .arguments import (
     EXIT_USAGE,
     OneLineParser,
     UsageError,
+    add_detector_options,
     add_filter_options,
     filter_options,
     intrinsics,
     one_line,
-    positive,
     quiet_codecs,
 )
 from .compare import BaselineFit, comparison_table, fit_baselines
@@ -82,8 +82,7 @@ def build_parser() -> argparse.ArgumentParser:
     camera.add_argument("--K2", metavar="fx,fy,cx,cy", type=intrinsics, help="of the second image, with --K1")
     camera.add_argument("--no-exif", action="store_true", help="do not read the focal length from EXIF data")
     matching = parser.add_argument_group("matching")
-    matching.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
-    matching.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
+    add_detector_options(matching)
     add_filter_options(parser)
     parser.add_argument("--version", action="version", version=f"mgca-match {__version__}")
     return parser

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import MgcaFilterError
-from ..features import DETECTORS
 from ..pipelines.run import Report, Summary, Workers
 from .arguments import (
     EXIT_FOUND,
@@ -19,6 +18,7 @@ from .arguments import (
     EXIT_USAGE,
     OneLineParser,
     UsageError,
+    add_detector_options,
     add_filter_options,
     filter_options,
     intrinsics,
@@ -93,8 +93,7 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
     command.add_argument("--overlap", metavar="N", type=positive(int), default=10, help="sequential: N next images")
     command.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of all images, pixels")
     command.add_argument("--no-exif", action="store_true", help="without --K: guess the focal length, do not read EXIF")
-    command.add_argument("--detector", choices=DETECTORS, default="sift", help="default sift")
-    command.add_argument("--max-keypoints", metavar="N", type=positive(int), default=2000, help="default 2000")
+    add_detector_options(command)
     command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
     command.set_defaults(run=_run_folder)
     return command

@@ -119,7 +119,7 @@ def read_image(path: Path) -> Image:
 def detect(path: Path, quarter_turns: int = 0) -> ImageFeatures:
     """Features of an image file turned counter-clockwise by ``quarter_turns`` · 90°; kept for the latest 128 images.
 
-    They are those that :func:`mgca_filter.match_images` detects, in pixels of the stored image.
+    They are those that the training data has, plain SIFT and 2000 keypoints, in pixels of the stored image.
 
     Raises:
         DatasetError: the image is missing or cannot be read.

@@ -74,7 +74,7 @@ def kinds_of(pair: ScenePair) -> Iterator[tuple[str, ScenePair]]:
         if np.count_nonzero(kept) < 8:
             continue
         attributes = pair.attributes.take(kept)
-        if kind != "raw":  # whoever filters tells of no lost rivals
+        if kind != "raw":  # whoever filters tells of no lost alternatives
             attributes = replace(attributes, best=np.ones(np.count_nonzero(kept), dtype=bool))
         yield (
             kind,

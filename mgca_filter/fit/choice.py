@@ -32,8 +32,8 @@ MIN_PARALLAX_PX = 1.5
 MIN_SHARE, MAX_SHARE = 0.02, 0.8
 # Residuals between these, pixels, say how densely wrong matches lie around an epipolar line.
 BACKGROUND_PX = (6.0, 18.0)
-# Beyond this angle two hypotheses are rivals and not the same answer.
-RIVAL_DEG = 5.0
+# Beyond this angle two hypotheses are alternatives and not the same answer.
+ALTERNATIVE_DEG = 5.0
 AGREEMENT_DEG = (2.0, 5.0, 10.0)
 # Half a pixel is the noise of SIFT's keypoints, more than enough; scales of the likelihood multiply it.
 NOISE_PX = 0.5
@@ -48,7 +48,7 @@ _TINY = 1e-12
 FEATURES = (
     *("log count", "log weighted count", "log share", "log weighted share"),
     *("log significance", "log weighted significance", "likelihood per inlier"),
-    *("likelihood to rival", "plain likelihood to rival", "support to rival"),
+    *("likelihood to alternative", "plain likelihood to alternative", "support to alternative"),
     *("plain likelihood to best", "weighted support to best", "share behind"),
     *("near network E 3 deg", "near network E 10 deg", "no network E"),
     *(f"other families within {angle:g} deg" for angle in AGREEMENT_DEG),
@@ -59,7 +59,7 @@ FEATURES = (
 EARLY_FEATURES = (
     "log count",
     "log share",
-    "plain likelihood to rival",
+    "plain likelihood to alternative",
     "share behind",
     "log uncertainty deg",
     "log significance",
@@ -241,7 +241,7 @@ def judge(
         correspondences: (N, 4) on the normalised image planes, each keypoint once.
         scores: (N,) probabilities of the matches; None before the network.
         focal_px: mean focal length, pixels.
-        network_poses: R (G, 3, 3), t (G, 3): the poses that the network's own E allows, or None.
+        network_poses: R (G, 3, 3), t (G, 3): the poses that the network E allows, or None.
         coefficients: see :func:`log_likelihoods` and :func:`prior`.
     """
     residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px)
@@ -261,11 +261,11 @@ def judge(
     chosen = int(np.argmax(likelihood + _support_bonus(residuals, weights, coefficients)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
     angles = pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[chosen]], hypotheses.t[[chosen]])[:, 0]
-    rivals = angles > RIVAL_DEG
+    alternatives = angles > ALTERNATIVE_DEG
 
     def gap(values: Array) -> float:
         """How far the chosen one lies above the best of those that are another answer."""
-        return float(values[chosen] - (values[rivals].max() if rivals.any() else 0.0))
+        return float(values[chosen] - (values[alternatives].max() if alternatives.any() else 0.0))
 
     other = hypotheses.family != hypotheses.family[chosen]
     agreeing = [len(set(hypotheses.family[other & (angles < limit)].tolist())) for limit in AGREEMENT_DEG]
@@ -293,9 +293,9 @@ def judge(
         "log weighted significance": _significance(weighted, background[1]),
         "likelihood per inlier": likelihood[chosen]
         / (np.count_nonzero((distance[chosen] < 2.0) & front[chosen]) + 5.0),
-        "likelihood to rival": np.arcsinh(gap(likelihood) / GAP_UNIT),
-        "plain likelihood to rival": np.arcsinh(gap(plain) / GAP_UNIT),
-        "support to rival": np.arcsinh(gap(support) / GAP_UNIT),
+        "likelihood to alternative": np.arcsinh(gap(likelihood) / GAP_UNIT),
+        "plain likelihood to alternative": np.arcsinh(gap(plain) / GAP_UNIT),
+        "support to alternative": np.arcsinh(gap(support) / GAP_UNIT),
         "plain likelihood to best": np.arcsinh((plain[chosen] - plain.max()) / GAP_UNIT),
         "weighted support to best": np.arcsinh((support[chosen] - support.max()) / GAP_UNIT),
         "share behind": 1.0 - number / max(everything_near, 1),
@@ -327,7 +327,7 @@ def explains_list(judgement: Judgement, coefficients: Coefficients) -> bool:
 
     It explains enough of the list, by enough matches, which all lie in front of the cameras and hold it firmly, and no
     other answer, a twin under the dominant plane above all, comes near. ``coefficients["early_end"]``: least share,
-    least count, largest share behind, largest uncertainty in degrees, least log-likelihood above the best rival.
+    least count, largest share behind, largest uncertainty in degrees, least log-likelihood above the best alternative.
     """
     share, number, behind, uncertainty_deg, gap = coefficients["early_end"]
     f = judgement.features
@@ -336,7 +336,7 @@ def explains_list(judgement: Judgement, coefficients: Coefficients) -> bool:
         and f["log count"] > np.log(number)
         and f["share behind"] < behind
         and f["log uncertainty deg"] < np.log(uncertainty_deg)
-        and f["plain likelihood to rival"] > np.arcsinh(gap / GAP_UNIT)
+        and f["plain likelihood to alternative"] > np.arcsinh(gap / GAP_UNIT)
     )
 
 

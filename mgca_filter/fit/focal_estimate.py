@@ -24,6 +24,8 @@ _FACTORS = np.geomspace(0.25, 4.0, 19)
 # Where cameras lie from the guess, in the logarithm: mean and standard deviation over the scenes of the training data.
 _USUAL, _USUAL_SPREAD = -0.3, 0.35
 _THRESHOLD_PX = 2.0
+# What makes of the curvature a standard deviation that two thirds of the training pairs keep.
+_SIGMA_FACTOR, _LEAST_SIGMA = 3.0, 0.04
 # Under a focal length far from the right one matches lie this far off before the pose is refined.
 _REACH_PX = 16.0
 _ROUNDS = 6
@@ -31,8 +33,6 @@ _MAX_ROWS = 300
 _MIN_ROWS = 12
 # With this share of the matches that agree with F an essential matrix takes its place.
 _LEAST_AGREEMENT = 0.8
-# Beyond this standard deviation of the logarithm the matches do not determine the focal length.
-DETERMINED = 0.2
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,8 @@ def estimate_focal(evidence: Evidence, F: Array) -> FocalEstimate | None:
     if curve[0] <= 0:
         return None
     at = float(np.clip(-curve[1] / (2.0 * curve[0]), logs[best - 1], logs[best + 1]))
-    # A sum of squares over the noise: it rises by one at a standard deviation.
-    return FocalEstimate(float(np.exp(at)), float(1.0 / np.sqrt(curve[0])))
+    # A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
+    return FocalEstimate(float(np.exp(at)), float(np.hypot(_SIGMA_FACTOR / np.sqrt(curve[0]), _LEAST_SIGMA)))
 
 
 def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free_model: TwoViewModel) -> bool:

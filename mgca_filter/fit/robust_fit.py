@@ -35,7 +35,7 @@ REFINE_PX = 1.0
 SAME_DEG, TWIN_DEG = 0.3, 2.0
 # The early end is given up where a run explains less than the first share of the list; above the second, one will do.
 PROMISING, CERTAIN = 0.3, 0.7
-# A twin that explains less than this share of what the best pose does, before it is refined, is no rival.
+# A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
 TWIN_SHARE = 0.5
 
 # What needs no network; then what uses it; then what is still tried where those do not settle it.

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from ..fit.homography_fit import HomographyFit, HomographyOptions, estimate_homography
 from ..fit.planarity import MEANINGFUL_LOG10_NFA, homography_false_alarms
-from ..geometry.epipolar import essential_from_pose
+from ..geometry.epipolar import essential_from_pose, project_to_essential
 from ..geometry.homography import scaled_homography, transfer
 from ..inputs.keypoints import read_keypoints
 from ..inputs.options import FilterOptions, check_integer, check_number
@@ -423,6 +423,7 @@ def _fit_essential(
         E = _essential_of_rotation(result.R)
     if E is None:
         E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
+        E = None if E is None else project_to_essential(E)  # OpenCV's own is one to a few digits only
     return E, _as_opencv_mask(result.mask, mask)
 
 

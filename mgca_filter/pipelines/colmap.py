@@ -376,11 +376,21 @@ def _write_images(
         table = np.column_stack([image.points + HALF_PIXEL, _scale(image) / 2, np.radians(_angle(image))])
         database.write_keypoints(ids[name], table.astype(np.float32))
         if image.descriptors is not None and image.descriptors.shape[1:] == (128,):
-            data = image.descriptors.astype(np.uint8)  # OpenCV's SIFT: integers 0 … 255 as float32
-            database.write_descriptors(
-                ids[name], pycolmap.FeatureDescriptors(type=pycolmap.FeatureExtractorType.SIFT, data=data)
+            data = pycolmap.FeatureDescriptors(
+                type=pycolmap.FeatureExtractorType.SIFT, data=_sift_bytes(image.descriptors)
             )
+            database.write_descriptors(ids[name], data)
     return ids
+
+
+def _sift_bytes(descriptors: NDArray[Any]) -> NDArray[np.uint8]:
+    """SIFT descriptors (N, 128) as COLMAP keeps them.
+
+    OpenCV's are bytes already, of any dtype; those of unit norm (RootSIFT, which is COLMAP's own default as well) are
+    multiplied by 512, rounded and cut off at 255 as by COLMAP's ``FeatureDescriptorsToUnsignedByte``.
+    """
+    unit_norm = descriptors.dtype.kind == "f" and descriptors.max(initial=0.0) <= 1.0
+    return np.clip(np.rint(descriptors * (512.0 if unit_norm else 1.0)), 0, 255).astype(np.uint8)
 
 
 def _scale(image: ImageFeatures) -> NDArray[Any]:

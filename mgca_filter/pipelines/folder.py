@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..features import ImageFeatures
+from ..features import DEFAULT_DETECTOR, DEFAULT_FEATURE_COUNT, ImageFeatures
 from ..images import principal_point_doubt
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
@@ -161,8 +161,8 @@ class FolderJob:
     pairs: Sequence[tuple[str, str]]
     output: Path
     K: NDArray[np.float64] | None = None
-    detector: str = "sift"
-    max_keypoints: int = 2000
+    detector: str = DEFAULT_DETECTOR
+    max_keypoints: int = DEFAULT_FEATURE_COUNT
     cache: Path | None = None
     report: Report | None = None
     exif: bool = True

@@ -57,7 +57,8 @@ def test_broken_answers_of_twins_are_noticed() -> None:
 def test_command_prints_what_was_tried(model_file, capsys, monkeypatch) -> None:
     assert bad_input.main(["--model", str(model_file), "--rounds", "2"]) == 0
     out = capsys.readouterr().out
-    assert f"{len(KINDS) * 2 * 5 + len(bad_input.FILES)} inputs tried, 0 failures" in out
+    count = len(KINDS) * 2 * 6 + len(bad_input.FILES) + len(bad_input.DATABASES)
+    assert f"{count} inputs tried, 0 failures" in out
     monkeypatch.setattr(bad_input, "matchMGCA", lambda *arguments: 1 / 0)
     assert bad_input.main(["--model", str(model_file), "--rounds", "1"]) == 1
     done = capsys.readouterr()

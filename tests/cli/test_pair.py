@@ -172,9 +172,11 @@ K_A, K_B = np.array([[5.0, 0, 3], [0, 6, 4], [0, 0, 1]]), np.array([[7.0, 0, 1],
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        ([], {"detector": "sift", "max_keypoints": 2000, "threshold": 1.0, "method": "auto", "seed": 0}),
+        ([], {"detector": "rootsift", "max_keypoints": 4000, "threshold": 1.0, "method": "auto", "seed": 0}),
         ([], {"K1": None, "K2": None, "model": None, "providers": None}),
         (["--detector", "orb"], {"detector": "orb"}),
+        (["--detector", "sift"], {"detector": "sift"}),
+        (["--detector", "brisk"], {"detector": "brisk"}),
         (["--max-keypoints", "77"], {"max_keypoints": 77}),
         (["--threshold", "2.5"], {"threshold": 2.5}),
         (["--keep-precision", "0.9"], {"keep_precision": 0.9}),

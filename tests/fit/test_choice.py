@@ -259,7 +259,7 @@ EASY = {
     "log count": np.log(200.0),
     "share behind": 0.0,
     "log uncertainty deg": np.log(0.05),
-    "plain likelihood to rival": np.arcsinh(500.0),
+    "plain likelihood to alternative": np.arcsinh(500.0),
 }
 
 
@@ -274,7 +274,7 @@ def easy(**changes: float) -> Judgement:
         ("log count", np.log(40.0)),
         ("share behind", 0.1),
         ("log uncertainty deg", np.log(2.0)),
-        ("plain likelihood to rival", np.arcsinh(1.0)),
+        ("plain likelihood to alternative", np.arcsinh(1.0)),
     ],
 )
 def test_every_doubt_asks_the_network(name: str, value: float) -> None:

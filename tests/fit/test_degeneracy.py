@@ -10,7 +10,7 @@ from mgca_filter import FilterResult, MatchFilter, Status
 from mgca_filter.fit.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
 from mgca_filter.fit.focal_check import FOCAL_STEP, better_focal_factor
 from mgca_filter.geometry.cameras import normalize_points
-from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg, translation_error_deg
 from mgca_filter.geometry.pose_refinement import refine_pose
 
 
@@ -20,7 +20,7 @@ def run(match_filter: MatchFilter, scene: Scene, **options: object) -> FilterRes
 
 
 @pytest.mark.parametrize("seed", range(5))
-@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (60, 500), (300, 30)])
+@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (100, 500), (300, 30)])
 def test_general_scene_is_ok(match_filter: MatchFilter, right: int, wrong: int, seed: int) -> None:
     scene = make_scene(right=right, wrong=wrong, seed=seed)
     result = run(match_filter, scene)
@@ -29,7 +29,7 @@ def test_general_scene_is_ok(match_filter: MatchFilter, right: int, wrong: int, 
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (60, 300)])
+@pytest.mark.parametrize(("right", "wrong"), [(120, 80), (100, 300)])
 def test_plane_keeps_the_pose_and_adds_the_homography(
     match_filter: MatchFilter, right: int, wrong: int, seed: int
 ) -> None:
@@ -173,3 +173,22 @@ def test_better_focal_factor_undoes_a_scale(scale: float) -> None:
 def test_hopeless_matches_ask_for_no_other_focal_length(count: int) -> None:
     scene = make_scene()
     assert better_focal_factor(np.zeros((count, 4)), scene.R, scene.t, 1.0 / K[0, 0]) is None
+
+
+@pytest.mark.parametrize("relief", [0.02, 0.2])
+@pytest.mark.parametrize("wrong", [0, 150])
+def test_a_long_lens_on_a_shallow_relief(match_filter: MatchFilter, relief: float, wrong: int) -> None:
+    """Focal length 11365 px, an object 1 m away, translation alone: OpenCV's directions are off by up to 12 degrees."""
+    rng = np.random.default_rng(0)
+    lens = np.array([[11365.0, 0.0, 1023.5], [0.0, 11365.0, 767.5], [0.0, 0.0, 1.0]])
+    pixels = rng.uniform((0, 0), (2048, 1536), (300, 2))
+    X = np.column_stack([(pixels - lens[:2, 2]) / 11365.0, np.ones(300)]) * (1.0 + rng.uniform(0, relief, (300, 1)))
+    t = np.array([0.03, 0.01, 0.005])
+    Y = (X + t) @ lens.T
+    second = Y[:, :2] / Y[:, 2:]
+    first, second = (points + rng.normal(0, 0.2, points.shape) for points in (pixels, second))
+    second[:wrong] = second[rng.permutation(wrong)]
+    result = match_filter.filter(first, second, None, K1=lens)
+    assert result.status in (Status.OK, Status.PLANAR)
+    assert result.mask[wrong:].mean() > 0.95
+    assert translation_error_deg(result.t, t) < 5.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -136,10 +137,12 @@ def test_only_wrong_matches_lie_on_no_plane(match_filter: MatchFilter, intrinsic
 
 @pytest.mark.parametrize(
     ("kind", "options"),
-    [("general", {"K1": None}), ("planar", {"K1": None}), ("rotation", {}), ("collinear", {})],
-    ids=["guessed", "guessed-plane", "rotation", "collinear"],
+    [("general", {"geometry": "fundamental"}), ("planar", {"K1": None}), ("rotation", {}), ("collinear", {})],
+    ids=["fundamental", "guessed-plane", "rotation", "collinear"],
 )
-def test_no_confidence_where_no_pose_is_claimed(match_filter: MatchFilter, kind: str, options: dict) -> None:
+def test_no_confidence_where_no_pose_is_claimed(model_file: Path, kind: str, options: dict) -> None:
+    options = dict(options)
+    match_filter = MatchFilter(model=model_file, geometry=options.pop("geometry", "auto"))
     assert run(match_filter, make_scene(kind), **options).confidence is None
 
 

@@ -161,6 +161,50 @@ def test_two_cameras_and_their_distortion(scene: Scene) -> None:
         assert pose_error_deg(R, t, scene.R, scene.t) < 1.0
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32, np.int32, np.int64, np.uint16])
+@pytest.mark.parametrize("shape", [(-1, 2), (-1, 1, 2)])
+def test_two_cameras_in_every_type_of_points(dtype: type, shape: tuple[int, ...]) -> None:
+    """OpenCV itself raises on integers there: they are not undistorted."""
+    scene = make_scene(right=300, wrong=120, noise_px=0.0)
+    K2 = np.array([[450.0, 0.0, 319.5], [0.0, 450.0, 239.5], [0.0, 0.0, 1.0]])
+    rays2 = (scene.points2 - K[:2, 2]) / K[0, 0]
+    points1, points2 = (np.clip(p, 0, 2000) for p in (scene.points1, rays2 * 450.0 + K2[:2, 2]))
+    if np.issubdtype(dtype, np.integer):
+        points1, points2 = np.round(points1), np.round(points2)
+    first, second = (np.ascontiguousarray(p.astype(dtype).reshape(shape)) for p in (points1, points2))
+    for E, mask in (
+        findEssentialMat(first, second, K, None, K2, None),
+        findEssentialMat(
+            points1=first, points2=second, cameraMatrix1=K, distCoeffs1=None, cameraMatrix2=K2, distCoeffs2=None
+        ),
+    ):
+        normalised = [(points1 - K[:2, 2]) / K[0, 0], (points2 - K2[:2, 2]) / 450.0]
+        _, R, t, _ = cv2.recoverPose(E, *normalised, np.eye(3), mask=mask.copy())
+        assert pose_error_deg(R, t, scene.R, scene.t) < 2.0
+        assert mask[scene.inlier].mean() > 0.75
+
+
+def test_forward_motion_of_a_visual_odometry_front_end() -> None:
+    """Normalised points in the order current, reference, focal 1, principal point (0, 0), a threshold of 0.0003."""
+    rng = np.random.default_rng(0)
+    camera = np.array([[718.9, 0.0, 607.2], [0.0, 718.9, 185.2], [0.0, 0.0, 1.0]])
+    u = rng.uniform((0, 0), (1241, 376), (800, 2))
+    reference = (u - camera[:2, 2]) / camera[0, 0]
+    X = np.column_stack([reference, np.ones(800)]) * rng.uniform(6, 60, (800, 1))
+    R_true, t_true = cv2.Rodrigues(np.array([0.01, -0.03, 0.0]))[0], np.array([0.03, -0.01, -1.0])
+    Y = X @ R_true.T + t_true
+    current = Y[:, :2] / Y[:, 2:]
+    reference, current = (x + rng.normal(0, 0.2 / camera[0, 0], x.shape) for x in (reference, current))
+    current[400:] = current[400 + rng.permutation(400)]
+    E, mask = findEssentialMat(
+        current, reference, focal=1, pp=(0.0, 0.0), method=cv2.RANSAC, prob=0.999, threshold=0.0003
+    )
+    _, R, t, _ = cv2.recoverPose(E, current, reference, focal=1, pp=(0.0, 0.0), mask=mask.copy())
+    assert pose_error_deg(R, t, R_true.T, -R_true.T @ t_true) < 1.5
+    assert mask[:400].mean() > 0.5
+    assert mask[400:].mean() < 0.1
+
+
 def test_normalised_points_give_what_pixels_give(scene: Scene) -> None:
     x1, x2 = ((p - K[:2, 2]) / K[0, 0] for p in (scene.points1, scene.points2))
     pixels_E, pixels_mask = findEssentialMat(scene.points1, scene.points2, K, threshold=0.8)

@@ -9,6 +9,8 @@ import resource
 import signal
 import subprocess
 import sys
+from dataclasses import fields
+from inspect import signature
 
 import cv2
 import h5py
@@ -19,6 +21,7 @@ from exif_files import FOCAL_35MM, with_exif
 from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
+from mgca_filter.features import create_detector, describe
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.html_report import write_folder_report
 from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
@@ -414,3 +417,28 @@ def test_a_report_that_cannot_be_written_is_told_before_the_work(image_folder, t
         assert run(image_folder, output, "--html", page) == 2
         assert_one_line(capsys.readouterr(), str(page), words)
     assert not (tmp_path / "out.jsonl.work").exists()
+
+
+@pytest.mark.parametrize("name", ["sift", "rootsift"])
+def test_written_descriptors_are_of_the_kind_that_colmap_and_hloc_have(image_folder, views, tmp_path, name):
+    pycolmap = pytest.importorskip("pycolmap")
+    found = describe(views[0].image, create_detector(name, 300)).descriptors
+    words = ["--pairs", "sequential", "--overlap", 1, "--max-keypoints", 300, "--detector", name]
+    assert run(image_folder, tmp_path / "out.db", *words) == 0
+    with contextlib.closing(pycolmap.Database.open(tmp_path / "out.db")) as database:
+        (image,) = (image for image in database.read_all_images() if image.name == views[0].name)
+        stored = np.asarray(database.read_descriptors(image.image_id).data)
+    assert stored.dtype == np.uint8
+    # COLMAP's own are of norm 512, whichever their normalisation.
+    np.testing.assert_allclose(np.linalg.norm(stored.astype(float), axis=1), 512, rtol=0.05)
+    np.testing.assert_allclose(stored, np.minimum(found * (512 if name == "rootsift" else 1), 255), atol=0.5001)
+    assert run(image_folder, tmp_path / "out.h5", *words) == 0
+    with h5py.File(tmp_path / "out.features.h5") as features:
+        np.testing.assert_array_equal(features[views[0].name]["descriptors"][()].T, found)
+
+
+def test_a_folder_is_matched_with_the_defaults_of_match_images():
+    job = {field.name: field.default for field in fields(FolderJob)}
+    alone = signature(match_images).parameters
+    assert [job[name] for name in ("detector", "max_keypoints")] == ["rootsift", 4000]
+    assert [alone[name].default for name in ("detector", "max_keypoints")] == ["rootsift", 4000]

@@ -148,3 +148,22 @@ def test_a_damaged_dataset_costs_its_own_pairs_only(tmp_path, views, raw_matches
     assert_one_line(capsys.readouterr(), NAMES[2])
     kept = {name: (values > -1).any() for name, values in contents(tmp_path / "out.h5").items() if "matches0" in name}
     assert sorted(kept.values()) == [False, True]
+
+
+def test_half_precision_loses_no_matches(tmp_path, views, raw_matches):
+    """hloc can store keypoints as float16, good to a quarter of a pixel at 640."""
+    counts = {}
+    for dtype in (np.float16, np.float32):
+        folder = tmp_path / np.dtype(dtype).name
+        folder.mkdir()
+        features, matches = write_files(folder, views, {(0, 1): raw_matches[0, 1]})
+        with h5py.File(features, "r+") as file:
+            for name in NAMES[:2]:
+                points = file[name]["keypoints"][()].astype(dtype)
+                del file[name]["keypoints"]
+                file[name]["keypoints"] = points
+        assert run(features, matches, folder / "filtered.h5", "-q") == 0
+        with h5py.File(folder / "filtered.h5") as file:
+            group = file[NAMES[0].replace("/", "-")][NAMES[1].replace("/", "-")]
+            counts[dtype] = np.count_nonzero(group["matches0"][()] > -1)
+    assert counts[np.float16] > 0.9 * counts[np.float32] > 50
