@@ -18,8 +18,8 @@ constexpr double kMinParallaxPx = 1.5;
 constexpr double kMinShare = 0.02, kMaxShare = 0.8;
 // Residuals between these, pixels, say how densely wrong matches lie around an epipolar line.
 constexpr double kBackgroundLowPx = 6.0, kBackgroundHighPx = 18.0;
-// Beyond this angle two hypotheses are rivals and not the same answer.
-constexpr double kRivalDeg = 5.0;
+// Beyond this angle two hypotheses are alternatives and not the same answer.
+constexpr double kAlternativeDeg = 5.0;
 constexpr std::array<double, 3> kAgreementDeg{2.0, 5.0, 10.0};
 // Half a pixel is the noise of SIFT's keypoints, more than enough; scales of the likelihood multiply it.
 constexpr double kNoisePx = 0.5;
@@ -35,7 +35,7 @@ constexpr std::array<double, 3> kSupportPx{1.0, 2.0, 4.0}, kSupportWeights{1.0, 
 constexpr double kLeastExponent = -60.0;
 
 constexpr std::array<Feature, 6> kEarlyFeatures{
-    Feature::log_count,    Feature::log_share,           Feature::plain_likelihood_to_rival,
+    Feature::log_count,    Feature::log_share,           Feature::plain_likelihood_to_alternative,
     Feature::share_behind, Feature::log_uncertainty_deg, Feature::log_significance,
 };
 
@@ -250,13 +250,13 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         angles.push_back(pose_angle_deg(hypothesis.pose, hypotheses[chosen].pose));
     }
     const auto gap = [&](const std::vector<double>& values) {
-        double best_rival = -std::numeric_limits<double>::infinity();
+        double best_alternative = -std::numeric_limits<double>::infinity();
         for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
-            if (angles[h] > kRivalDeg) {
-                best_rival = std::max(best_rival, values[h]);
+            if (angles[h] > kAlternativeDeg) {
+                best_alternative = std::max(best_alternative, values[h]);
             }
         }
-        return values[chosen] - (std::isfinite(best_rival) ? best_rival : 0.0);
+        return values[chosen] - (std::isfinite(best_alternative) ? best_alternative : 0.0);
     };
     const auto other_families = [&](double limit) {
         std::set<Family> families;
@@ -310,9 +310,9 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     set(Feature::log_significance, significance(number, around / width));
     set(Feature::log_weighted_significance, significance(weighted, weighted_around / width));
     set(Feature::likelihood_per_inlier, likelihood[chosen] / (static_cast<double>(near_two) + 5.0));
-    set(Feature::likelihood_to_rival, std::asinh(gap(likelihood) / kGapUnit));
-    set(Feature::plain_likelihood_to_rival, std::asinh(gap(plain) / kGapUnit));
-    set(Feature::support_to_rival, std::asinh(gap(support) / kGapUnit));
+    set(Feature::likelihood_to_alternative, std::asinh(gap(likelihood) / kGapUnit));
+    set(Feature::plain_likelihood_to_alternative, std::asinh(gap(plain) / kGapUnit));
+    set(Feature::support_to_alternative, std::asinh(gap(support) / kGapUnit));
     set(Feature::plain_likelihood_to_best,
         std::asinh((plain[chosen] - *std::max_element(plain.begin(), plain.end())) / kGapUnit));
     set(Feature::weighted_support_to_best,
@@ -351,7 +351,7 @@ bool explains_list(const Judgement& judgement, const Coefficients& coefficients)
     const std::vector<double>& rule = coefficients.early_end;
     return judgement[Feature::log_share] > std::log(rule[0]) && judgement[Feature::log_count] > std::log(rule[1]) &&
            judgement[Feature::share_behind] < rule[2] && judgement[Feature::log_uncertainty_deg] < std::log(rule[3]) &&
-           judgement[Feature::plain_likelihood_to_rival] > std::asinh(rule[4] / kGapUnit);
+           judgement[Feature::plain_likelihood_to_alternative] > std::asinh(rule[4] / kGapUnit);
 }
 
 std::vector<double> posterior(const Residuals& residuals, const std::vector<Mask>& groups, double scale,

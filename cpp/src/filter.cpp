@@ -193,6 +193,11 @@ Result Filter::operator()(const MatchPair& matches) const {
         if (focal && verdict.status == Status::suspicious_intrinsics) {
             verdict.status = Status::low_support;  // the intrinsics are nobody's claim
         }
+        if (focal && verdict.status == Status::planar) {
+            verdict.E.reset();  // a plane tells no focal length
+            verdict.R.reset();
+            verdict.t.reset();
+        }
         if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }

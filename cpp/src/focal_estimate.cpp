@@ -16,6 +16,8 @@ constexpr double kSmallestFactor = 0.25, kLargestFactor = 4.0;
 // Where cameras lie from the guess, in the logarithm: mean and standard deviation over the scenes of the training data.
 constexpr double kUsual = -0.3, kUsualSpread = 0.35;
 constexpr double kThresholdPx = 2.0;
+// What makes of the curvature a standard deviation that two thirds of the training pairs keep.
+constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
 // Under a focal length far from the right one matches lie this far off before the pose is refined.
 constexpr double kReachPx = 16.0;
 constexpr int kRounds = 6;
@@ -95,8 +97,8 @@ std::optional<FocalEstimate> estimate_focal(const Evidence& evidence, const cv::
         return std::nullopt;
     }
     const double log_factor = std::clamp(logs[best] - slope / (2.0 * curvature), logs[best - 1], logs[best + 1]);
-    // A sum of squares over the noise: it rises by one at a standard deviation.
-    return FocalEstimate{std::exp(log_factor), 1.0 / std::sqrt(curvature)};
+    // A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
+    return FocalEstimate{std::exp(log_factor), std::hypot(kSigmaFactor / std::sqrt(curvature), kLeastSigma)};
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -13,7 +13,7 @@ namespace {
 constexpr double kSameDeg = 0.3, kTwinDeg = 2.0;
 // The early end is given up where a run explains less than the first share of the list; above the second, one will do.
 constexpr double kPromising = 0.3, kCertain = 0.7;
-// A twin that explains less than this share of what the best pose does, before it is refined, is no rival.
+// A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
 constexpr double kTwinShare = 0.5;
 
 constexpr Proposal kList{"list", Family::list_uniform, Source::listed, Estimator::magsac, 0.5, 300, 0};

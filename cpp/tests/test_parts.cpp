@@ -219,7 +219,7 @@ void the_likelier_hypothesis_is_chosen() {
     Coefficients c = coefficients();
     const Judgement judged = judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c);
     check::equal(judged.chosen, std::size_t{1}, "the true pose");
-    check::that(judged[Feature::likelihood_to_rival] > 3.0, "far from its rival");
+    check::that(judged[Feature::likelihood_to_alternative] > 3.0, "far from the alternative");
     check::near(judged[Feature::no_network], 1.0, 0.0, "no network E");
     check::equal(judge_hypotheses(matches, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
                  "without scores as well");
