@@ -195,4 +195,4 @@ fillLinks();
 fillTable();
 showCell();
 if (DATA.links.length) goToPair(DATA.links[0][0], DATA.links[0][1]);
-window.report = { view, pairs, links: DATA.links, goToPair };
+window.report = { view, pairs, links: DATA.links, goToPair, matrix };

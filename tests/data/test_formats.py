@@ -132,14 +132,14 @@ def test_a_bundle_pair_without_translation_cannot_be_judged(tmp_path: Path):
 # Lists of image pairs
 
 
-def test_a_list_matches_images_as_match_images_does(photos: Path, tmp_path: Path):
+def test_a_list_matches_images_as_match_images_does_with_the_training_detector(photos: Path, tmp_path: Path):
     (source,) = open_sources([write_list(tmp_path / "walls.txt", pair_line())], "pairs", photos)
     pair = pickle.loads(pickle.dumps(source))[0]
     assert (pair.scene, pair.image1, pair.image2, pair.image_size1) == ("walls", "a.png", "b.png", SIZE)
     distance = symmetric_epipolar_distance_squared(pair.correspondences, essential_from_pose(R_TRUE, T_TRUE))
     assert (distance[pair.mutual] < 1e-4).mean() > 0.7
     images = [cv2.imread(str(photos / name)) for name in ("a.png", "b.png")]
-    expected = match_images(*images, K1=K)
+    expected = match_images(*images, K1=K, detector="sift", max_keypoints=2000)
     rows = np.array([(m[0].queryIdx, m[0].trainIdx) for m in expected.matches])
     np.testing.assert_allclose(pair.points1, np.array([k.pt for k in expected.keypoints1])[rows[:, 0]])
     np.testing.assert_allclose(pair.points2, np.array([k.pt for k in expected.keypoints2])[rows[:, 1]])

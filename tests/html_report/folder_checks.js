@@ -26,6 +26,7 @@ const CHECKS = {
     const canvas = byId("matrix");
     const box = canvas.getBoundingClientRect();
     const { view, pairs } = report;
+    report.matrix.resize(); // draws now: a browser without a screen may show no frame
     const cell = Math.min(box.width, box.height) / view.order.length;
     const cellOf = (a, b) => [(view.order.indexOf(b) + 0.5) * cell, (view.order.indexOf(a) + 0.5) * cell];
     const hover = (a, b) => (point(canvas, "pointermove", cellOf(a, b)), text("cell-words"));
