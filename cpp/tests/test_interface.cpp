@@ -130,7 +130,7 @@ void data_never_throws(const Model& model) {
     std::vector<float> special{0.0F, -0.0F, 1.0F, nan, infinity, -infinity, 1e30F, 1e-30F, 100.0F, 1e6F};
     for (const mgca::Method method : {mgca::Method::automatic, mgca::Method::prosac, mgca::Method::magsac,
                                       mgca::Method::ransac, mgca::Method::none}) {
-        for (const int count : {0, 1, 2, 5, 7, 8, 9, 33, 70}) {
+        for (const int count : {0, 1, 5, 7, 8, 9, 40}) {
             for (const bool calibrated : {true, false}) {
                 std::vector<cv::Point2f> points1, points2;
                 std::vector<cv::DMatch> matches;
