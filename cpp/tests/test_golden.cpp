@@ -136,7 +136,7 @@ private:
     void judgement() const {
         // It depends on which sources met the same pose, by chance. Of a pure rotation every direction is as good.
         if (check::equal(result_.confidence.has_value(), expected_.has("confidence"), name_ + ": has a confidence") &&
-            exact_ && result_.t) {
+            exact_ && result_.t && result_.confidence) {
             check::near(*result_.confidence, expected_["confidence"].number(), 2e-3, name_ + ": confidence");
         }
         if (check::equal(result_.focal_factor.has_value(), expected_.has("focal_factor"),
@@ -147,7 +147,8 @@ private:
         if (exact_ && expected_.has("ended") && result_.status != mgca::Status::pure_rotation) {
             check::equal(result_.ended, expected_["ended"].text(), name_ + ": ended");
         }
-        if (exact_ && expected_.has("support")) {
+        // The search for homographies draws from another generator than Python's.
+        if (exact_ && expected_.has("support") && expected_.has("ended")) {
             check::equal(result_.support.value_or(-1), static_cast<int>(expected_["support"].number()),
                          name_ + ": support");
         }
