@@ -57,7 +57,7 @@ def draw_matches(image1: Image, image2: Image, points1: ArrayLike, points2: Arra
     Raises:
         ValueError: an image is empty or no uint8 image, or points and mask differ in length.
     """
-    canvas, place1, place2 = _side_by_side(_as_bgr(image1, "image1"), _as_bgr(image2, "image2"))
+    canvas, place1, place2 = _side_by_side(as_bgr(image1, "image1"), as_bgr(image2, "image2"))
     start = np.asarray(points1, dtype=np.float64).reshape(-1, 2)
     end = np.asarray(points2, dtype=np.float64).reshape(-1, 2)
     mask = np.asarray(panel.mask, dtype=bool)
@@ -100,16 +100,21 @@ class _Place:
         return np.clip(scaled, 0.0, (self.size[0] - 1.0, self.size[1] - 1.0)) + (self.left_px, 0.0)
 
 
-def _as_bgr(image: Image, name: str) -> Image:
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or image.size == 0:
-        raise ValueError(f"{name} must be a non-empty uint8 image, got {image.dtype} of shape {image.shape}")
-    channels = 1 if image.ndim == 2 else image.shape[2]
+def as_bgr(image: ArrayLike, name: str) -> Image:
+    """Image (h, w), (h, w, 1), (h, w, 3) BGR or (h, w, 4) BGRA uint8 as (h, w, 3) BGR.
+
+    Raises:
+        ValueError: it is empty, of another type or of another number of channels.
+    """
+    array = np.asarray(image)
+    if array.dtype != np.uint8 or array.ndim not in (2, 3) or array.size == 0:
+        raise ValueError(f"{name} must be a non-empty uint8 image, got {array.dtype} of shape {array.shape}")
+    channels = 1 if array.ndim == 2 else array.shape[2]
     if channels not in (1, 3, 4):
         raise ValueError(f"{name} must have 1, 3 or 4 channels, got {channels}")
     if channels == 1:
-        image = np.repeat(image.reshape(*image.shape[:2], 1), 3, axis=2)
-    return np.ascontiguousarray(image[:, :, :3])
+        array = np.repeat(array.reshape(*array.shape[:2], 1), 3, axis=2)
+    return np.ascontiguousarray(array[:, :, :3])
 
 
 def _side_by_side(image1: Image, image2: Image) -> tuple[Image, _Place, _Place]:

@@ -17,23 +17,6 @@ _QUALITIES = (88, 80, 72, 64, 56, 48)
 _NOTHING = 65535  # code of NaN
 
 
-def as_bgr(image: Any, name: str) -> Image:
-    """Image (h, w), (h, w, 1), (h, w, 3) BGR or (h, w, 4) BGRA uint8 as (h, w, 3) BGR.
-
-    Raises:
-        ValueError: it is empty, of another type or of another number of channels.
-    """
-    array = np.asarray(image)
-    if array.dtype != np.uint8 or array.ndim not in (2, 3) or array.size == 0:
-        raise ValueError(f"{name} must be a non-empty uint8 image, got {array.dtype} of shape {array.shape}")
-    channels = 1 if array.ndim == 2 else array.shape[2]
-    if channels not in (1, 3, 4):
-        raise ValueError(f"{name} must have 1, 3 or 4 channels, got {channels}")
-    if channels == 1:
-        array = np.repeat(array.reshape(*array.shape[:2], 1), 3, axis=2)
-    return np.ascontiguousarray(array[:, :, :3])
-
-
 def embed_images(
     images: Sequence[Image], budget_bytes: int, max_side_px: int = MAX_SIDE_PX, least_side_px: int = 160
 ) -> list[str]:

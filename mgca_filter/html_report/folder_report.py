@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..atomic_file import replaced_when_done
+from ..drawing import as_bgr
 from ..verdict_text import BAD, CAUTION, GOOD, VerdictText
-from .embedded import as_bgr, embed_images, pack
+from .embedded import embed_images, pack
 from .match_graph import MatchGraph, build_graph
 from .page import LIMIT_BYTES, build_page
 

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import __version__
 from ..atomic_file import replaced_when_done
+from ..drawing import as_bgr
 from ..geometry.cameras import Intrinsics, mean_focal_length, normalize_points, resolve_intrinsics
 from ..geometry.epipolar import (
     essential_from_pose,
@@ -30,7 +31,7 @@ from ..geometry.epipolar import (
 from ..geometry.homography import homography_distance
 from ..result import FilterResult
 from ..verdict_text import describe_verdict
-from .embedded import as_bgr, embed_images, pack, pack_mask
+from .embedded import embed_images, pack, pack_mask
 from .page import LIMIT_BYTES, build_page
 
 Array = NDArray[np.float64]
