@@ -125,6 +125,11 @@ class SceneBundle:
         self._check_values()
 
     @property
+    def photographs(self) -> str:
+        """The scene without its detector: bundles ``lounge`` and ``lounge.orb2k`` are made of the same photographs."""
+        return self.scene.partition(".")[0]
+
+    @property
     def _packed_fields(self) -> tuple[str, ...]:
         return () if self.learned else ("match_mutual", "match_best")
 

@@ -57,19 +57,21 @@ def load_network(path: str | Path) -> MGCANet:
 
 
 def transfer_weights(source: MGCANet, target: MGCANet) -> None:
-    """Let ``target`` start from the weights of a network of equal width and equally many stages or fewer.
+    """Let ``target`` start from the weights of a network of equal width.
 
-    A stage that the source lacks starts as a copy of its last one. Where a layer sees more inputs than in the source,
-    the further ones count nothing at first; what has no counterpart keeps its random start. Equal networks end up
-    with equal weights.
+    A stage that the source lacks starts as a copy of its last one; of a source with more stages the first are taken,
+    without their final consensus. Where a layer sees more inputs than in the source, the further ones count nothing
+    at first; what has no counterpart keeps its random start. Equal networks end up with equal weights.
 
     Raises:
         ValueError: the networks differ in more than their stages and what is fed back.
     """
     same = replace(source.config, stages=target.config.stages, refined_feedback=target.config.refined_feedback)
-    if same != target.config or source.config.stages > target.config.stages:
+    if same != target.config:
         raise ValueError(f"weights of {source.config} are no start for {target.config}")
     known = source.state_dict()
+    if source.config.stages > target.config.stages:  # a consensus of more stages than there are
+        known = {name: tensor for name, tensor in known.items() if not name.startswith("final")}
     for name, tensor in target.state_dict().items():
         old = known.get(_STAGE_NUMBER.sub(lambda match: _last_known(match, source.config.stages), name))
         if old is None:

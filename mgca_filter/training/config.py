@@ -99,15 +99,17 @@ class ScheduleConfig:
 class TrainingConfig:
     """Everything a run depends on besides the data itself.
 
-    ``scenes`` names the bundles to train on; empty = all that the sources hold. ``tuning_scenes`` are kept
-    out of training: what is chosen often is chosen on them. ``validation`` names further bundles or OANet dumps,
-    from the folder that ``--data`` names, to look at while training.
+    ``scenes`` names what to train on; empty = all that the sources hold. ``tuning_scenes`` are kept out of training:
+    what is chosen often is chosen on them. ``doubtful_scenes``, whose poses are suspect, are in neither. A name stands
+    for the bundles of all detectors: ``lounge`` for ``lounge.orb2k`` as well. ``validation`` names further bundles or
+    OANet dumps, from the folder that ``--data`` names, to look at while training.
     """
 
     name: str
     seed: int = 0
     scenes: tuple[str, ...] = ()
     tuning_scenes: tuple[str, ...] = ()
+    doubtful_scenes: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
     sources: tuple[SourceConfig, ...] = (SourceConfig(),)
     network: NetworkConfig = field(default_factory=NetworkConfig)

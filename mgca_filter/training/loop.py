@@ -45,7 +45,7 @@ class Trainer:
         validate: figures of a network in per cent, every ``validate_every`` steps and at the end; None = never.
         device: torch device.
         workers: processes that prepare batches; 0 prepares them in this one.
-        initial_weights: weights to start from, of a network that has equally many stages or fewer.
+        initial_weights: weights to start from, of a network of equal width.
     """
 
     def __init__(

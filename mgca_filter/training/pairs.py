@@ -66,14 +66,15 @@ def clean_labels(pair: ScenePair | TrainingPair) -> NDArray[np.int8]:
     """Labels of each raw match (M,), told from pose and depth.
 
     Right: within 1.5e-5 of the true epipolar geometry, in front of both cameras, and at a depth inside half
-    to twice the range of the pair's sure matches (mutual, ratio below 0.85; at least 8 of them, else depth is
-    not tested). Wrong: beyond 1e-4. Near the epipolar line a third of the accidents are told by depth alone.
+    to twice the range of the pair's sure matches (mutual, ratio below 0.85 where it is known; at least 8 of them, else
+    depth is not tested). Wrong: beyond 1e-4. Near the epipolar line a third of the accidents are told by depth alone.
     """
     distance = symmetric_epipolar_distance_squared(pair.correspondences, pair.E)
     depth1, depth2 = triangulated_depths(pair.correspondences, pair.R, pair.t)
     close = (distance < POSITIVE_DISTANCE) & (depth1 > 0) & (depth2 > 0)
-    assert pair.attributes.ratio is not None
-    sure = close & pair.mutual & (pair.attributes.ratio < SURE_RATIO) & np.isfinite(depth1)
+    sure = close & pair.mutual & np.isfinite(depth1)
+    if pair.attributes.ratio is not None:
+        sure &= pair.attributes.ratio < SURE_RATIO
     if np.count_nonzero(sure) >= SURE_COUNT:
         low, high = np.percentile(depth1[sure], DEPTH_PERCENTILES)
         close &= (depth1 > 0.5 * low) & (depth1 < 2.0 * high)

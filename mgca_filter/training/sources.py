@@ -187,21 +187,23 @@ def open_sources(config: TrainingConfig, data: Path) -> OpenedSources:
         if source.kind == "bundles"
     }
     everything = list(dict.fromkeys(bundle for group in bundles.values() for bundle in group))
-    names = {bundle.scene for bundle in everything}
-    for key, wanted in (("scenes", config.scenes), ("tuning_scenes", config.tuning_scenes)):
-        missing = [scene for scene in wanted if scene not in names]
+    names = {bundle.photographs for bundle in everything}
+    for key in ("scenes", "tuning_scenes", "doubtful_scenes"):
+        missing = [scene for scene in getattr(config, key) if scene not in names]
         if missing:
             raise ConfigError(f"{key}: not in the data folder: {', '.join(missing)}")
-    chosen = names.intersection(config.scenes or names).difference(config.tuning_scenes)
-    training = [bundle for bundle in everything if bundle.scene in chosen]
+    chosen = names.intersection(config.scenes or names).difference(config.tuning_scenes, config.doubtful_scenes)
+    training = [bundle for bundle in everything if bundle.photographs in chosen]
     for bundle in training:
         bundle.check_training_pairs()
     sources = [
-        _open(source, config, data, [bundle for bundle in bundles.get(index, []) if bundle.scene in chosen])
+        _open(source, config, data, [bundle for bundle in bundles.get(index, []) if bundle.photographs in chosen])
         for index, source in enumerate(config.sources)
     ]
     mixed = sources[0] if len(sources) == 1 else MixedSource(sources, [source.weight for source in config.sources])
-    return OpenedSources(mixed, training, [bundle for bundle in everything if bundle.scene in config.tuning_scenes])
+    # A learned matcher's lists have no raw matches to make validation's kinds of input from.
+    tuning = [bundle for bundle in everything if bundle.photographs in config.tuning_scenes and not bundle.learned]
+    return OpenedSources(mixed, training, tuning)
 
 
 def _open(source: SourceConfig, config: TrainingConfig, data: Path, bundles: list[SceneBundle]) -> DataSource:

@@ -73,6 +73,12 @@ def test_depth_is_tested_only_where_the_pair_has_sure_matches(unsure):
     assert (clean_labels(pair_of(*at_depths(few))) == POSITIVE).all()
 
 
+def test_mutual_matches_are_sure_where_no_ratio_is_known():
+    depths = np.concatenate([np.linspace(4.0, 8.0, 60), [1.0, 30.0]])
+    pair = dataclasses.replace(pair_of(*at_depths(depths)), attributes=MatchAttributes())
+    assert clean_labels(pair)[60:].tolist() == [IGNORED, IGNORED]
+
+
 def test_right_and_wrong_matches_of_a_scene():
     scene = make_scene(noise_px=0.1, right=200, wrong=200)
     base = pair_of(scene.points1, scene.points2, ratio=0.6)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import make_scene
 from photographs import write_photographs
-from scene_bundles import bundle_fields, write_bundle
+from scene_bundles import bundle_fields, learned_fields, write_bundle
 
 from mgca_filter.data.scene_bundle import LABEL_FIELD, SceneBundle
 from mgca_filter.errors import BundleError, DatasetError
@@ -166,6 +166,27 @@ def test_scenes_choose_among_all_bundle_sources(data, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=message):
             open_sources(dataclasses.replace(config, **changes), data)
+
+
+def test_a_name_stands_for_the_bundles_of_all_detectors(tmp_path):
+    scenes = [make_scene(seed=seed) for seed in range(2)]
+    for name in ("hall", "hall.orb2k", "yard.orb2k", "attic"):
+        write_bundle(tmp_path / f"{name}.npz", scenes)
+    write_bundle(tmp_path / "hall.aliked_lightglue.npz", scenes, **learned_fields(scenes))
+    config = TrainingConfig(name="x", tuning_scenes=("hall",), doubtful_scenes=("attic",))
+    opened = open_sources(config, tmp_path)
+    assert [bundle.scene for bundle in opened.training] == ["yard.orb2k"]
+    assert [bundle.scene for bundle in opened.tuning] == ["hall", "hall.orb2k"]  # validation tests ratios
+    with pytest.raises(ConfigError, match="doubtful_scenes: not in the data folder: cellar"):
+        open_sources(dataclasses.replace(config, doubtful_scenes=("cellar",)), tmp_path)
+
+
+def test_lists_of_a_learned_matcher_are_drawn_without_what_it_does_not_know(tmp_path):
+    scenes = [make_scene(seed=seed, right=200, wrong=100) for seed in range(2)]
+    write_bundle(tmp_path / "hall.aliked_lightglue.npz", scenes, **learned_fields(scenes))
+    pair = open_sources(TrainingConfig(name="x"), tmp_path).source.draw(np.random.default_rng(0))
+    assert not pair.attributes.encode(len(pair)).any()
+    assert {POSITIVE, NEGATIVE} <= set(pair.labels.tolist())
 
 
 @pytest.mark.parametrize(
