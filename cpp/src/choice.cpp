@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
 #include <limits>
 #include <numeric>
 #include <set>
@@ -29,6 +30,7 @@ constexpr int kShareRounds = 8;
 // Gaps between log-likelihoods are compressed beyond this.
 constexpr double kGapUnit = 3.0;
 constexpr double kLargestPrior = 0.98;
+constexpr double kTiny = 1e-12;
 // Relative support is measured at these distances, pixels, which count this much.
 constexpr std::array<double, 3> kSupportPx{1.0, 2.0, 4.0}, kSupportWeights{1.0, 1.0, 0.5};
 // A density whose exponent is below this adds nothing to a likelihood in double precision.
@@ -86,12 +88,12 @@ std::vector<double> log_relative_support(const std::vector<Residuals>& residuals
     const double total = std::accumulate(kSupportWeights.begin(), kSupportWeights.end(), 0.0);
     for (std::size_t k = 0; k < kSupportPx.size(); ++k) {
         const std::vector<double> sums = supports(residuals, weights, kSupportPx[k]);
-        const double largest = std::max(*std::max_element(sums.begin(), sums.end()), 1e-12);
+        const double largest = std::max(*std::max_element(sums.begin(), sums.end()), kTiny);
         for (std::size_t h = 0; h < sums.size(); ++h) {
             mean[h] += kSupportWeights[k] / total * sums[h] / largest;
         }
     }
-    std::transform(mean.begin(), mean.end(), mean.begin(), [](double value) { return std::log(std::max(value, 1e-12)); });
+    std::transform(mean.begin(), mean.end(), mean.begin(), [](double value) { return std::log(std::max(value, kTiny)); });
     return mean;
 }
 
@@ -118,6 +120,7 @@ Coefficients Coefficients::read(const Json& values) {
     c.outlier_width_px = checked(values, "outlier_width_px", 1);
     c.seen_behind = checked(values, "seen_behind", 1);
     c.support_weight = checked(values, "support_weight", 1);
+    c.crowding = checked(values, "crowding", 2);
     c.early_end = checked(values, "early_end", 5);
     c.settled = checked(values, "settled", 3);
     c.verdict = checked(values, "verdict", 2);
@@ -167,9 +170,41 @@ double score_prior(double score, const Coefficients& coefficients) {
     return std::min(trust[0] * std::pow(score, trust[1]) + trust[2], kLargestPrior);
 }
 
+std::vector<double> independent_counts(const Correspondences& matches, const std::vector<double>& weights,
+                                       const Coefficients& coefficients) {
+    if (matches.empty()) {
+        return {};
+    }
+    const double side = coefficients.crowding[0], power = coefficients.crowding[1];
+    Correspondence low = matches.front(), high = matches.front();
+    for (const Correspondence& match : matches) {
+        for (int k = 0; k < 4; ++k) {
+            low[k] = std::min(low[k], match[k]);
+            high[k] = std::max(high[k], match[k]);
+        }
+    }
+    const double diagonal1 = std::hypot(high[0] - low[0], high[1] - low[1]);
+    const double diagonal2 = std::hypot(high[2] - low[2], high[3] - low[3]);
+    std::map<std::array<std::int64_t, 4>, double> sums;
+    std::vector<std::array<std::int64_t, 4>> cells;
+    for (std::size_t i = 0; i < matches.size(); ++i) {
+        std::array<std::int64_t, 4>& cell = cells.emplace_back();
+        for (int k = 0; k < 4; ++k) {
+            const double width = side * std::max(k < 2 ? diagonal1 : diagonal2, kTiny);
+            cell[static_cast<std::size_t>(k)] = static_cast<std::int64_t>(std::floor((matches[i][k] - low[k]) / width));
+        }
+        sums[cell] += weights[i];
+    }
+    std::vector<double> counts;
+    for (const std::array<std::int64_t, 4>& cell : cells) {
+        counts.push_back(std::pow(std::max(sums[cell], 1.0), -power));
+    }
+    return counts;
+}
+
 std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& residuals,
                                                  const std::vector<double>& probability,
-                                                 const Coefficients& coefficients) {
+                                                 const Coefficients& coefficients, const std::vector<double>& counts) {
     std::vector<double> odds;
     odds.reserve(probability.size());
     for (const double p : probability) {
@@ -184,7 +219,8 @@ std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& r
                 const double squared = residual.distance_px[i] * residual.distance_px[i];
                 const double density = mixture_density(squared, scale, coefficients);
                 if (density > 0.0) {
-                    sum += std::log1p(odds[i] * (residual.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0) * density);
+                    const double sign = residual.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0;
+                    sum += counts[i] * std::log1p(odds[i] * sign * density);
                 }
             }
             row.push_back(sum);
@@ -212,16 +248,16 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     const double share =
         std::clamp(static_cast<double>(most_inliers) / static_cast<double>(std::max<std::size_t>(count, 1)), kMinShare,
                    kMaxShare);
-    const auto plain_by_scale = log_likelihoods(residuals, std::vector<double>(count, share), coefficients);
-    std::vector<double> weights(count, share);
+    const std::vector<double> weights = scores ? *scores : std::vector<double>(count, share);
+    const std::vector<double> counts = independent_counts(matches, weights, coefficients);
+    const auto plain_by_scale = log_likelihoods(residuals, std::vector<double>(count, share), coefficients, counts);
     auto by_scale = plain_by_scale;
     if (scores) {
-        weights = *scores;
         std::vector<double> probability;
         for (const double score : weights) {
             probability.push_back(score_prior(score, coefficients));
         }
-        by_scale = log_likelihoods(residuals, probability, coefficients);
+        by_scale = log_likelihoods(residuals, probability, coefficients, counts);
     }
     // One scale for all hypotheses: that of the most likely one.
     std::vector<double> best_by_scale(coefficients.noise_scales.size(), -std::numeric_limits<double>::infinity());
@@ -237,7 +273,11 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         plain.push_back(plain_by_scale[h][column]);
     }
     std::vector<double> merit = likelihood;
-    const std::vector<double> relative = log_relative_support(residuals, weights);
+    std::vector<double> counted = weights;
+    for (std::size_t i = 0; i < count; ++i) {
+        counted[i] *= counts[i];
+    }
+    const std::vector<double> relative = log_relative_support(residuals, counted);
     const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(count), 1.5);
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
         merit[h] += factor * relative[h];
@@ -276,7 +316,8 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     const Residuals& residual = residuals[chosen];
     const double scale = coefficients.noise_scales[column];
     double around = 0.0, weighted_around = 0.0, weighted = 0.0, sum_of_weights = 0.0;
-    std::size_t everything_near = 0, near_two = 0;
+    std::size_t everything_near = 0;
+    double near_two = 0.0;
     Correspondences firm;
     for (std::size_t i = 0; i < count; ++i) {
         const double distance = residual.distance_px[i];
@@ -288,7 +329,7 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         }
         everything_near += distance < 1.0 ? 1 : 0;
         weighted += distance < 1.0 && front ? weights[i] : 0.0;
-        near_two += distance < 2.0 && front ? 1 : 0;
+        near_two += distance < 2.0 && front ? counts[i] : 0.0;
         if (distance < 3.0 * kNoisePx * scale && front) {
             firm.push_back(matches[i]);
         }
@@ -309,7 +350,7 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     set(Feature::log_weighted_share, std::log((weighted + 0.1) / (sum_of_weights + 0.2)));
     set(Feature::log_significance, significance(number, around / width));
     set(Feature::log_weighted_significance, significance(weighted, weighted_around / width));
-    set(Feature::likelihood_per_inlier, likelihood[chosen] / (static_cast<double>(near_two) + 5.0));
+    set(Feature::likelihood_per_inlier, likelihood[chosen] / (near_two + 5.0));
     set(Feature::likelihood_to_alternative, std::asinh(gap(likelihood) / kGapUnit));
     set(Feature::plain_likelihood_to_alternative, std::asinh(gap(plain) / kGapUnit));
     set(Feature::support_to_alternative, std::asinh(gap(support) / kGapUnit));

@@ -47,7 +47,7 @@ constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);
 /// Coefficients by name, from the model file.
 struct Coefficients {
     std::vector<double> score_trust, noise_px, noise_weights, noise_scales, outlier_width_px, seen_behind, early_end,
-        support_weight, settled, verdict, confidence, early_confidence;
+        support_weight, crowding, settled, verdict, confidence, early_confidence;
 
     /// Throws std::invalid_argument where one is missing, or has another length or values.
     static Coefficients read(const Json& values);
@@ -79,10 +79,18 @@ Residuals measure_residuals(const Correspondences& matches, const Pose& pose, do
 /// Larger of the angles of rotation and of direction (sign ignored) between two poses, degrees.
 double pose_angle_deg(const Pose& a, const Pose& b);
 
+/// What each match counts: less, the more of them lie together in both images.
+///
+/// @param weights probabilities of the matches.
+std::vector<double> independent_counts(const Correspondences& matches, const std::vector<double>& weights,
+                                       const Coefficients& coefficients);
+
 /// Log-likelihood ratios against all matches being wrong: for each hypothesis one for each scale of the noise.
+///
+/// @param counts what each match counts.
 std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& residuals,
                                                  const std::vector<double>& probability,
-                                                 const Coefficients& coefficients);
+                                                 const Coefficients& coefficients, const std::vector<double>& counts);
 
 /// Probability that a match of a score is right as the likelihood believes it.
 double score_prior(double score, const Coefficients& coefficients);

@@ -272,11 +272,12 @@ std::optional<TwoViewModel> Search::fundamental() {
         return std::nullopt;
     }
     std::vector<double> probability = select(evidence_.network->scores, evidence_.once);
+    const std::vector<double> counts = independent_counts(judged_, probability, coefficients_);
     for (double& score : probability) {
         score = score_prior(score, coefficients_);
     }
     std::size_t best = 0, best_column = 0;
-    const auto likelihood = log_likelihoods(residuals, probability, coefficients_);
+    const auto likelihood = log_likelihoods(residuals, probability, coefficients_, counts);
     for (std::size_t column = 0; column < coefficients_.noise_scales.size(); ++column) {
         for (std::size_t h = 0; h < found.size(); ++h) {
             if (likelihood[h][column] > likelihood[best][best_column]) {

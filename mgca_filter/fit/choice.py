@@ -2,8 +2,9 @@
 
 The choice is the likelihood of the matches, each of which is right with a probability that its score gives, and then
 lies about its epipolar line by a mixture of normal distributions, in front of both cameras; or it is wrong, and
-anywhere. On long lists matches are far from independent and the likelihood is too sure of itself: there the support,
-the summed scores of the matches near by, counts the more, the longer the list is.
+anywhere. Matches are far from independent: those that lie together in both images, on a repeated window above all, are
+right or wrong together and count less each. Long lists stay too sure of themselves even so: there the support, the
+summed scores of the matches near by, is added, and counts the more, the longer the list is.
 The confidence is a logistic regression on measurements of the chosen hypothesis: how much of the list it explains, how
 far the best *other* answer falls behind, which unlike sources found the same, how firmly its inliers hold it. All
 hypotheses are measured on all distinct matches in one vectorised pass. The numbers are data, a dict of lists of floats,
@@ -76,6 +77,7 @@ COEFFICIENTS = {
     "outlier_width_px": 1,
     "seen_behind": 1,
     "support_weight": 1,
+    "crowding": 2,
     "early_end": 5,
     "settled": 3,
     "verdict": 2,
@@ -184,11 +186,33 @@ def pairwise_angles_deg(R: Array, t: Array, R_other: Array, t_other: Array) -> A
     return np.asarray(np.degrees(np.maximum(rotation, direction)))
 
 
-def log_likelihoods(residuals: Residuals, probability: Array, coefficients: Coefficients) -> Array:
+def independent_counts(correspondences: Array, weights: Array, coefficients: Coefficients) -> Array:
+    """What each match (N,) counts: less, the more of them lie together in both images.
+
+    Args:
+        correspondences: (N, 4) on the normalised image planes.
+        weights: (N,) probabilities of the matches.
+        coefficients: ``crowding``: side of a cell in either image, as a share of the diagonal of its points' extent,
+            and power p: a match in a cell whose probabilities sum to s > 1 counts s ** -p.
+    """
+    side, power = coefficients["crowding"]
+    low, high = correspondences.min(axis=0), correspondences.max(axis=0)
+    diagonal = np.repeat(np.hypot(*(high - low).reshape(2, 2).T), 2)
+    cells = np.floor((correspondences - low) / (side * np.maximum(diagonal, _TINY))).astype(np.int64)
+    per_axis = int(1.0 / side) + 2
+    number = cells @ np.array([1, per_axis, per_axis**2, per_axis**3])
+    _, cell = np.unique(number, return_inverse=True)
+    return np.asarray(np.maximum(np.bincount(cell, weights), 1.0)[cell] ** -power)
+
+
+def log_likelihoods(
+    residuals: Residuals, probability: Array, coefficients: Coefficients, counts: Array | None = None
+) -> Array:
     """Log-likelihood ratios (H, S) against all matches being wrong, for each scale of the noise.
 
     Args:
         probability: (N,) that a match is right, below 1.
+        counts: (N,) what each match counts (:func:`independent_counts`); None = 1.
         coefficients: ``noise_px`` and ``noise_weights`` of the mixture, ``noise_scales``, ``outlier_width_px``: the
             width across which a wrong match may lie; ``seen_behind``: share of right matches that lie behind a camera
             all the same, because they are off *along* their epipolar line, as in a corridor walked down.
@@ -201,7 +225,7 @@ def log_likelihoods(residuals: Residuals, probability: Array, coefficients: Coef
         density = np.zeros_like(squared)
         for sigma, weight in zip(coefficients["noise_px"], coefficients["noise_weights"]):
             density += (weight / (scale * sigma)) * np.exp((-0.5 / (scale * sigma) ** 2) * squared)
-        columns.append(np.log1p(odds * density).sum(axis=1))
+        columns.append(np.log1p(odds * density) @ (np.ones(len(probability)) if counts is None else counts))
     return np.stack(columns, axis=1)
 
 
@@ -250,15 +274,15 @@ def judge(
     near = (distance < 1.0) & front  # (H, N)
     inliers = near.sum(axis=1)
     share = float(np.clip(inliers.max() / max(count, 1), MIN_SHARE, MAX_SHARE))
-    plain_by_scale = log_likelihoods(residuals, np.full(count, share), coefficients)
-    if scores is None:
-        weights, by_scale = np.full(count, share), plain_by_scale
-    else:
-        weights, by_scale = scores, log_likelihoods(residuals, prior(scores, coefficients), coefficients)
+    weights = np.full(count, share) if scores is None else scores
+    counts = independent_counts(correspondences, weights, coefficients)
+    by_scale = plain_by_scale = log_likelihoods(residuals, np.full(count, share), coefficients, counts)
+    if scores is not None:
+        by_scale = log_likelihoods(residuals, prior(scores, coefficients), coefficients, counts)
     # One scale for all hypotheses: that of the most likely one.
     column = int(np.argmax(by_scale.max(axis=0)))
     likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
-    chosen = int(np.argmax(likelihood + _support_bonus(residuals, weights, coefficients)))
+    chosen = int(np.argmax(likelihood + _support_bonus(residuals, weights * counts, coefficients)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
     angles = pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[chosen]], hypotheses.t[[chosen]])[:, 0]
     alternatives = angles > ALTERNATIVE_DEG
@@ -291,8 +315,7 @@ def judge(
         "log weighted share": np.log((weighted + 0.1) / (weights.sum() + 0.2)),
         "log significance": _significance(number, background[0]),
         "log weighted significance": _significance(weighted, background[1]),
-        "likelihood per inlier": likelihood[chosen]
-        / (np.count_nonzero((distance[chosen] < 2.0) & front[chosen]) + 5.0),
+        "likelihood per inlier": likelihood[chosen] / (counts[(distance[chosen] < 2.0) & front[chosen]].sum() + 5.0),
         "likelihood to alternative": np.arcsinh(gap(likelihood) / GAP_UNIT),
         "plain likelihood to alternative": np.arcsinh(gap(plain) / GAP_UNIT),
         "support to alternative": np.arcsinh(gap(support) / GAP_UNIT),

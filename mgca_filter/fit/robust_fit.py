@@ -299,9 +299,11 @@ class Search:
         if not found:
             return None
         distance = np.stack([sampson_distance(self._judged, F) for F, _ in found]) * evidence.focal_px
-        probability = choice.prior(np.asarray(evidence.scores)[evidence.once], self._coefficients)
+        scores = np.asarray(evidence.scores)[evidence.once]
+        probability = choice.prior(scores, self._coefficients)
+        counts = choice.independent_counts(self._judged, scores, self._coefficients)
         residuals = Residuals(distance, np.zeros(distance.shape, dtype=bool))
-        likelihood = choice.log_likelihoods(residuals, probability, self._coefficients)
+        likelihood = choice.log_likelihoods(residuals, probability, self._coefficients, counts)
         F, origin = found[int(np.argmax(likelihood[:, int(np.argmax(likelihood.max(axis=0)))]))]
         E = project_to_essential(F)
         pose = pose_from_essential(F, evidence.correspondences, evidence.focal_px)

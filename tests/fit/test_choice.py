@@ -22,6 +22,7 @@ from mgca_filter.fit.choice import (
     confidence,
     early_confidence,
     explains_list,
+    independent_counts,
     judge,
     log_likelihoods,
     measure_residuals,
@@ -121,6 +122,52 @@ def test_likelihood_rises_with_matches_that_agree() -> None:
     assert trusted == sorted(trusted)
     assert likelihood_of([0.3], [True]) < likelihood_of([0.3], [False])
     assert likelihood_of([0.3], [True]) > 0  # seen in a corridor: less, and not nothing
+
+
+def test_matches_that_lie_together_count_less_each_and_more_in_all() -> None:
+    side, power = COEFFICIENTS["crowding"]
+    spread = np.random.default_rng(0).uniform(-0.5, 0.5, (40, 4))
+    sums = []
+    for crowd in (1, 4, 25, 100):
+        rows = np.concatenate([spread, np.tile(spread[:1], (crowd, 1))])
+        counts = independent_counts(rows, np.ones(len(rows)), COEFFICIENTS)
+        assert counts[-1] <= (crowd + 1.0) ** -power + 1e-12
+        assert counts.max() <= 1.0
+        sums.append(counts[len(spread) :].sum())
+        doubtful = independent_counts(rows, np.full(len(rows), 1e-3), COEFFICIENTS)  # hardly any of them is there
+        np.testing.assert_array_equal(doubtful, 1.0)
+    assert sums == sorted(sums)
+    assert sums[-1] < 12.0
+    apart = np.concatenate([spread, spread[:1] + [0.0, 0.0, 3.0 * side, 0.0]])  # together in one image alone
+    assert independent_counts(apart, np.ones(41), COEFFICIENTS)[-1] > 0.5**power
+
+
+@pytest.mark.parametrize("factor", [1e-3, 40.0])
+def test_what_a_match_counts_does_not_depend_on_units_or_on_which_image_is_first(factor: float) -> None:
+    rng = np.random.default_rng(1)
+    rows, weights = rng.normal(0.0, 0.1, (300, 4)), rng.uniform(size=300)
+    counts = independent_counts(rows, weights, COEFFICIENTS)
+    assert counts.min() < 0.9
+    np.testing.assert_array_equal(independent_counts(rows * 2.0**-3, weights, COEFFICIENTS), counts)
+    np.testing.assert_allclose(independent_counts(rows * factor, weights, COEFFICIENTS), counts)
+    np.testing.assert_allclose(independent_counts(rows[:, [2, 3, 0, 1]], weights, COEFFICIENTS), counts)
+    one_place = independent_counts(np.ones((9, 4)), np.ones(9), COEFFICIENTS)
+    np.testing.assert_allclose(one_place, 9.0 ** -COEFFICIENTS["crowding"][1])
+
+
+def test_a_repeated_window_does_not_outvote_the_rest_of_the_view() -> None:
+    """Matches spread over the view agree with the truth; a few more, all in one place, with another pose."""
+    scene = make_scene(right=60, wrong=0, noise_px=0.1)
+    other = rotation_from_vector(np.array([0.0, 0.0, 0.05])) @ scene.R
+    true, rng = normalized(scene), np.random.default_rng(2)
+    window = np.column_stack([rng.uniform(0.2, 0.23, (70, 2)), np.zeros((70, 2))])
+    rays = np.column_stack([window[:, :2], np.ones(70)]) @ other.T * 5.0 + scene.t
+    window[:, 2:] = rays[:, :2] / rays[:, 2:]
+    rows = np.concatenate([true, window])
+    poses = Hypotheses(np.stack([scene.R, other]), np.stack([scene.t] * 2), np.arange(2))
+    crowded = judge(rows, np.full(130, 0.9), poses, FOCAL, None, COEFFICIENTS)
+    each_alike = judge(rows, np.full(130, 0.9), poses, FOCAL, None, {**COEFFICIENTS, "crowding": [0.15, 0.0]})
+    assert (crowded.chosen, each_alike.chosen) == (0, 1)
 
 
 def test_prior_follows_the_score_and_stays_below_one() -> None:
