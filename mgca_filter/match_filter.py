@@ -28,7 +28,7 @@ from .inference.scoring import (
     select_network_input,
 )
 from .inputs.attributes import MatchAttributes
-from .inputs.options import FilterOptions, check_choice, check_path, check_providers, method_name
+from .inputs.options import FilterOptions, check_choice, check_providers, method_name
 from .inputs.pair import MatchPair, PairInput, prepare_pair
 from .result import FilterResult, Status
 from .types import MatchesLike, MatrixLike, PointsLike, Providers, SizeLike
@@ -36,9 +36,31 @@ from .types import MatchesLike, MatrixLike, PointsLike, Providers, SizeLike
 _BATCH_PAIRS = 8
 
 
-def model_path() -> Path:
-    """Where the ONNX file of the shipped model lies."""
-    return Path(__file__).resolve().parent / "models" / "mgca_small.onnx"
+PUBLISHED_MODELS = {"default": "mgca_small", "fast": "mgca_fast"}
+
+
+def model_path(name: str = "default") -> Path:
+    """Where the ONNX file of a published model lies: ``"default"``, or ``"fast"``, a network of one stage.
+
+    Raises:
+        ValueError: no model of this name is published.
+    """
+    if name not in PUBLISHED_MODELS:
+        raise ValueError(f"model: expected one of {', '.join(PUBLISHED_MODELS)}, got {name!r}")
+    return Path(__file__).resolve().parent / "models" / f"{PUBLISHED_MODELS[name]}.onnx"
+
+
+def find_model(model: str | Path | None) -> Path:
+    """The file that the option ``model`` means: a published model by its name, else a path; None = the default.
+
+    Raises:
+        TypeError: neither a name nor a path.
+    """
+    if model is None or (isinstance(model, str) and model in PUBLISHED_MODELS):
+        return model_path(model or "default")
+    if not isinstance(model, (str, Path)):
+        raise TypeError(f"model: expected a path or a name, got {type(model).__name__}")
+    return Path(model)
 
 
 class MatchFilter:
@@ -83,7 +105,7 @@ class MatchFilter:
             max_iterations=max_iterations,
             seed=seed,
         )
-        self._backend = shared_backend(check_path(model, model_path()), backend, check_providers(providers))
+        self._backend = shared_backend(find_model(model), backend, check_providers(providers))
 
     @classmethod
     def over(cls, backend: Backend, options: FilterOptions | None = None) -> MatchFilter:
@@ -395,7 +417,8 @@ def filter_matches(
         resolution: pixels of the original per pixel of the image in which the keypoints were found: the factor by which
             coordinates that were found in a smaller copy were multiplied, the larger of the two images'. ``threshold``,
             and the pixels by which the fit judges, are then those of the copy.
-        model: path of a model file (``.onnx`` or ``.safetensors``); None = the shipped model.
+        model: ``"default"``, ``"fast"`` (a network of one stage, for video), or the path of a model file (``.onnx`` or
+            ``.safetensors``); None = the default.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
         backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
         seed: of every random choice; same seed, input and machine give the same bits.

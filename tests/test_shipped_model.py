@@ -1,24 +1,32 @@
-"""The shipped model files: present, small, of the contract, and the same in ONNX Runtime and torch."""
+"""The published model files: present, small, of the contract, and the same in ONNX Runtime and torch."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import K, make_scene
 
 import mgca_filter
+from mgca_filter.errors import ModelError
 from mgca_filter.export import parity
 from mgca_filter.inference import Backend, shared_backend
+from mgca_filter.match_filter import PUBLISHED_MODELS
 from mgca_filter.network import PRESETS, NetworkConfig
 
-MODELS = Path(mgca_filter.__file__).parent / "models"
-ONNX, TORCH = MODELS / "mgca_small.onnx", MODELS / "mgca_small.safetensors"
+CONFIGS = {"default": PRESETS["small"], "fast": replace(PRESETS["small"], stages=1, refined_feedback=False)}
+
+
+@pytest.fixture(scope="module", params=PUBLISHED_MODELS)
+def name(request) -> str:
+    return request.param
 
 
 @pytest.fixture(scope="module")
-def backends() -> tuple[Backend, Backend]:
-    return shared_backend(ONNX, "onnxruntime"), shared_backend(TORCH, "torch")
+def backends(name) -> tuple[Backend, Backend]:
+    path = mgca_filter.model_path(name)
+    return shared_backend(path, "onnxruntime"), shared_backend(path.with_suffix(".safetensors"), "torch")
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 127, 2000])
@@ -27,15 +35,15 @@ def test_onnx_runtime_says_what_torch_says(backends, count):
     assert row.passed, parity.format_parity([row])
 
 
-def test_both_files_are_one_model(backends):
+def test_both_files_are_one_model(name, backends):
     onnx_metadata, torch_metadata = (vars(backend.metadata).copy() for backend in backends)
     priors = [metadata.pop("prior") for metadata in (onnx_metadata, torch_metadata)]
     for metadata in (onnx_metadata, torch_metadata):
         metadata.pop("sha256")
     assert onnx_metadata == torch_metadata
-    for name in ("weight1", "bias1", "weight2", "bias2"):
-        np.testing.assert_array_equal(getattr(priors[0], name), getattr(priors[1], name))
-    assert NetworkConfig.from_dict(onnx_metadata["config"]) == PRESETS["small"]
+    for layer in ("weight1", "bias1", "weight2", "bias2"):
+        np.testing.assert_array_equal(getattr(priors[0], layer), getattr(priors[1], layer))
+    assert NetworkConfig.from_dict(onnx_metadata["config"]) == CONFIGS[name]
 
 
 def test_right_matches_score_higher_than_wrong_ones(backends):
@@ -53,7 +61,25 @@ def test_right_matches_score_higher_than_wrong_ones(backends):
         assert auc > 0.9
 
 
-def test_files_are_small_and_described():
-    assert ONNX.stat().st_size < 20e6
-    card = (MODELS / "mgca_small.md").read_text(encoding="utf-8")
+def test_files_are_small_and_described(name):
+    path = mgca_filter.model_path(name)
+    assert path.stat().st_size < 16 * 2**20
+    card = path.with_suffix(".md").read_text(encoding="utf-8")
+    assert path.stem in card
     assert "licen" in card.lower()
+
+
+def test_published_models_have_names():
+    scene = make_scene(right=40, wrong=160, seed=3)
+    rows = (scene.points1, scene.points2, None)
+    told = [
+        mgca_filter.filter_matches(*rows, K1=K, K2=K, model=model, effort="full")
+        for model in (None, "default", mgca_filter.model_path(), "fast")
+    ]
+    assert [result.info["model"] for result in told] == ["mgca_small"] * 3 + ["mgca_fast"]
+    assert not np.array_equal(told[0].scores, told[3].scores)
+    for wrong, error in (("fastest", ModelError), (3, TypeError)):
+        with pytest.raises(error):
+            mgca_filter.MatchFilter(model=wrong)
+    with pytest.raises(ValueError, match="default, fast"):
+        mgca_filter.model_path("fastest")

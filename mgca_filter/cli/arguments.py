@@ -76,7 +76,9 @@ def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = 
     group.add_argument(
         "--geometry", choices=GEOMETRIES, default=FilterOptions.geometry, help="model that is fitted, default auto"
     )
-    group.add_argument("--model", metavar="FILE", type=Path, help="another ONNX model than the shipped one")
+    group.add_argument(
+        "--model", metavar="FILE", type=Path, help="default, fast, or a model file (.onnx, .safetensors)"
+    )
     group.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
     group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
 

@@ -179,10 +179,10 @@ def model_settings(model: str | None, options: dict[str, Any]) -> dict[str, Any]
     """
     import onnxruntime
 
-    from ..match_filter import MatchFilter, model_path
+    from ..match_filter import MatchFilter, find_model
 
     MatchFilter(model=model, **options)
-    path = Path(model_path() if model is None else model)
+    path = find_model(model)
     return {
         "model": path.name,
         "model_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),

@@ -77,15 +77,25 @@ def expected_calibration_error(probabilities: FloatArray, truth: BoolArray, bins
 def calibrate(
     model: Path, bundles: Path, scenes: Iterable[str], pairs_per_scene: int = PAIRS_PER_SCENE
 ) -> tuple[Calibration, float]:
-    """Calibration of a model file on scenes of a folder, and its expected error on as many other pairs of them."""
+    """Calibration of a model file on scenes of a folder, and its expected error on as many other pairs of them.
+
+    ``pairs_per_scene`` are drawn of each bundle of a scene, whatever its detector.
+    """
     from ..training.validation import select_pairs  # needs PyTorch, which the fit itself does not
 
-    pairs = select_pairs([SceneBundle(bundles / f"{scene}.npz") for scene in scenes], pairs_per_scene)
+    files = [path for scene in scenes for path in _bundles_of(bundles, scene)]
+    pairs = select_pairs([SceneBundle(path) for path in files], pairs_per_scene)
     logits, truth = collect_logits(model, pairs[::2])
     calibration = fit_calibration(np.concatenate(logits), np.concatenate(truth))
     logits, truth = collect_logits(model, pairs[1::2])
     probabilities = calibration.probabilities(np.concatenate(logits)).astype(float)
     return calibration, expected_calibration_error(probabilities, np.concatenate(truth))
+
+
+def _bundles_of(folder: Path, scene: str) -> list[Path]:
+    """``scene.npz`` and ``scene.detector.npz``; the first where there is neither, for the error that names it."""
+    found = [*folder.glob(f"{scene}.npz"), *sorted(folder.glob(f"{scene}.*.npz"))]
+    return found or [folder / f"{scene}.npz"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

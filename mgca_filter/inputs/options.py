@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -97,15 +96,6 @@ def check_integer(value: Any, name: str, least: int) -> int:
     if value < least:
         raise ValueError(f"{name}: expected {least} or more, got {value}")
     return int(value)
-
-
-def check_path(value: Any, default: Path) -> Path:
-    """The path, or ``default`` for None."""
-    if value is None:
-        return default
-    if not isinstance(value, (str, Path)):
-        raise TypeError(f"model: expected a path, got {type(value).__name__}")
-    return Path(value)
 
 
 def check_providers(value: Any) -> Providers | None:

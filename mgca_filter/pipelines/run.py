@@ -23,7 +23,7 @@ from .. import __version__
 from ..features import ImageFeatures
 from ..html_report.folder_report import PairLine, write_folder_report
 from ..inference.model_file import sha256_of
-from ..match_filter import MatchFilter, model_path
+from ..match_filter import MatchFilter, find_model
 from .journal import Journal, PipelineError, output_file
 from .worker import (
     EXPLAINED,
@@ -254,7 +254,7 @@ def run_identity(filter_options: dict[str, Any]) -> dict[str, Any]:
 
     The options of the filter, the content of its model and the version of this package: each of them changes rows.
     """
-    model = Path(filter_options.get("model") or model_path())
+    model = find_model(filter_options.get("model"))
     return {**filter_options, "model_sha256": sha256_of(model), "version": __version__}
 
 

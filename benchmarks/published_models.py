@@ -1,0 +1,123 @@
+"""Is the fast model enough? ``python -m benchmarks.published_models FOLDER [FOLDER ...]``.
+
+The filter with each published model on the same lists, of every detector and kind, and what a forward pass costs on one
+thread, in turn. ``--fill`` puts the tables into the fast model's card.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from mgca_filter.errors import DatasetError
+from mgca_filter.evaluation.our_rows import ProductMethod
+from mgca_filter.evaluation.predict import predict
+from mgca_filter.evaluation.store import ResultStore
+from mgca_filter.evaluation.summarize import scene_errors
+from mgca_filter.inference import Backend, shared_backend
+from mgca_filter.match_filter import PUBLISHED_MODELS, model_path
+from mgca_filter.tables import render_table
+
+from .fill_docs.pages import fill_file, provenance
+from .input_kinds import COMPARED, OURS, STATISTICS, Comparison
+from .match_lists import KINDS, DetectorScene, ListKind, open_detector_scenes
+from .speed import network_input
+from .study import run_study, study_parser
+
+PLACE, REFERENCE, FAST = "published_models", "default", "fast"
+SIZES, REPEATS = (100, 500, 2000), 9
+
+
+def comparisons(
+    scenes: Sequence[DetectorScene], kinds: Sequence[ListKind], store: ResultStore, workers: int
+) -> dict[tuple[str, str], Comparison]:
+    """The fast model against the default on the lists of each detector and kind."""
+    found = {}
+    for detector in dict.fromkeys(scene.detector for scene in scenes):
+        for kind in kinds:
+            listed = [scene.lists(kind) for scene in scenes if scene.detector == detector]
+            selections = [selection for selection in listed if selection is not None]
+            if not selections:
+                continue
+            errors = {}
+            for name, model in ((OURS, FAST), (REFERENCE, REFERENCE)):
+                method = ProductMethod("product", model=str(model_path(model)))
+                errors[name] = scene_errors(predict([method], selections, store=store, workers=workers)[method.name])
+            pairs = sum(runs.shape[1] for runs in errors[OURS].values())
+            found[detector, kind.name] = Comparison.of(errors, np.zeros((1, pairs), dtype=bool))
+    return found
+
+
+def format_comparisons(found: dict[tuple[str, str], Comparison]) -> str:
+    """A row a detector and kind of list, and their mean."""
+    rows = []
+    for (detector, kind), one in found.items():
+        bounds = [one.against(REFERENCE, key) for key in COMPARED]
+        differences = [f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]" for middle, low, high in bounds]
+        figures = [" / ".join(f"{one.figures[name][key]:.1f}" for key in STATISTICS) for name in (REFERENCE, OURS)]
+        rows.append([detector, kind, str(one.lists), *figures, *differences])
+    means = [
+        " / ".join(f"{np.mean([one.figures[name][key] for one in found.values()]):.1f}" for key in STATISTICS)
+        for name in (REFERENCE, OURS)
+    ]
+    middles = [f"{np.mean([one.differences[REFERENCE][key] for one in found.values()]):+.1f}" for key in COMPARED]
+    rows.append(["mean", "", str(sum(one.lists for one in found.values())), *means, *middles])
+    header = ["detector", "list", "lists", "default", "fast", *(f"difference in {key}" for key in COMPARED)]
+    return render_table(header, rows)
+
+
+def network_ms(backends: dict[str, Backend], count: int) -> dict[str, float]:
+    """Least duration of a forward pass of each model on ``count`` matches, milliseconds, in turn."""
+    inputs, best = network_input(count), dict.fromkeys(backends, float("inf"))
+    for _ in range(REPEATS):
+        for name, backend in backends.items():
+            started = time.perf_counter()
+            backend.infer(*inputs)
+            best[name] = min(best[name], 1000.0 * (time.perf_counter() - started))
+    return best
+
+
+def format_times() -> str:
+    """Milliseconds of the network by number of matches, one thread, and their ratio."""
+    backends = {name: shared_backend(model_path(name), "onnxruntime") for name in PUBLISHED_MODELS}
+    rows = []
+    for count in SIZES:
+        ms = network_ms(backends, count)
+        rows.append([str(count), *(f"{ms[name]:.1f}" for name in backends), f"{ms[FAST] / ms[REFERENCE]:.2f}"])
+    return render_table(["matches", *(f"{name}, ms" for name in backends), "ratio"], rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 = done, 2 = a file or option that cannot be used."""
+    parser = study_parser("published_models", __doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("bundles", metavar="FOLDER", nargs="+", type=Path, help="folders of scene bundles, or bundles")
+    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone, as the bundles' names have them")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="of lists (default: all)")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
+    parser.add_argument("--store", metavar="DIR", help="keep results here, and take from here what is known")
+    parser.add_argument("--fill", action="store_true", help="put the tables into the fast model's card")
+    return run_study(run, parser.parse_args(arguments))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print both tables."""
+    scenes = open_detector_scenes(options.bundles, options.detectors, None, options.per_scene, options.seed, None)
+    kinds = [KINDS[name] for name in dict.fromkeys(options.kinds)]
+    found = comparisons(scenes, kinds, ResultStore(options.store), options.workers)
+    if not found:
+        raise DatasetError(f"{', '.join(map(str, options.bundles))}: no list of the kinds {', '.join(options.kinds)}")
+    tables = f"{format_comparisons(found)}\n\n{format_times()}"
+    print(tables)
+    if options.fill:
+        fill_file(model_path(FAST).with_suffix(".md"), {PLACE: f"{tables}\n\n{provenance()}"})
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
