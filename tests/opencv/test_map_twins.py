@@ -8,7 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from hostile_points import HOSTILE_POINTS
+from point_arrays import HOSTILE_POINTS, LAYOUTS
 
 from mgca_filter import patch_cv2
 from mgca_filter.geometry.homography import transfer
@@ -204,17 +204,10 @@ def test_a_mask_passed_in_is_written_to() -> None:
         assert set(np.unique(mask)) <= {0, 1}
 
 
-@pytest.mark.parametrize("layout", [np.float32, "N1", "1N", list, int], ids=str)
-def test_layouts_of_the_points(layout: Any) -> None:
-    convert = {
-        "N1": lambda p: p[:, None],
-        "1N": lambda p: p[None],
-        list: lambda p: p.tolist(),
-        np.float32: np.float32,
-        int: lambda p: np.round(p).astype(int),
-    }[layout]
+@pytest.mark.parametrize("laid_out", LAYOUTS.values(), ids=LAYOUTS)
+def test_layouts_of_the_points(laid_out: Callable[[np.ndarray], Any]) -> None:
     first, second, _ = points(MAPS["homography"])
-    H, mask = findHomography(convert(first), convert(second), cv2.RANSAC)
+    H, mask = findHomography(laid_out(first), laid_out(second), cv2.RANSAC)
     assert mask.shape == (300, 1)
     assert corner_error(H, MAPS["homography"]) < 2.0
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from conftest import SIZE, K, Scene, make_scene
-from hostile_points import HOSTILE_POINTS
+from point_arrays import HOSTILE_POINTS, LAYOUTS
 
 import mgca_filter
 from mgca_filter import Status, filter_matches, findEssentialMat, findFundamentalMat, matchMGCA, patch_cv2
@@ -129,16 +129,9 @@ def test_overloads_of_the_fundamental_matrix_agree(scene: Scene) -> None:
         np.testing.assert_array_equal(again, mask)
 
 
-@pytest.mark.parametrize("layout", [np.float32, "N1", "1N", list, int], ids=str)
-def test_layouts_of_the_points(scene: Scene, layout: Any) -> None:
-    convert = {
-        "N1": lambda p: p[:, None],
-        "1N": lambda p: p[None],
-        list: lambda p: p.tolist(),
-        np.float32: np.float32,
-        int: lambda p: np.round(p).astype(int),
-    }[layout]
-    E, mask = findEssentialMat(convert(scene.points1), convert(scene.points2), K, threshold=2.0)
+@pytest.mark.parametrize("laid_out", LAYOUTS.values(), ids=LAYOUTS)
+def test_layouts_of_the_points(scene: Scene, laid_out: Callable[[np.ndarray], Any]) -> None:
+    E, mask = findEssentialMat(laid_out(scene.points1), laid_out(scene.points2), K, threshold=2.0)
     assert mask.shape == (250, 1)
     _, R, t, _ = cv2.recoverPose(E, scene.points1, scene.points2, K, mask=mask)
     assert pose_error_deg(R, t, scene.R, scene.t) < 3.0
