@@ -40,6 +40,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory, views: list) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_both_verify_what_colmap_keeps(rendered: Path, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     database = tmp_path / "colmap.db"

@@ -59,7 +59,7 @@ def test_command_prints_ratios_for_bundles_alone(
 ) -> None:
     pytest.importorskip("poselib")
     for name in ("hall.orb2k", "hall.akaze2k"):
-        write_bundle(tmp_path / f"{name}.npz", [make_scene(), make_scene(seed=1)])
+        write_bundle(tmp_path / f"{name}.npz", [make_scene(right=60, wrong=20, seed=seed) for seed in range(2)])
     options = ["--bundles", str(tmp_path), "--repeats", "1", "--model", str(model_file)]
 
     def number_of_lists(*more: str) -> int:

@@ -35,6 +35,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ONNXSLIM_MAX_ITER", "1")  # further rounds of onnxslim leave the answer and take their time
 
 
+@pytest.mark.slow
 def test_files_are_written_listed_and_compared(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -253,6 +253,7 @@ def test_a_matrix_wherever_opencv_has_one(family: str, count: int) -> None:
     assert mask.shape == (count, 1)
 
 
+@pytest.mark.slow  # chance needs many draws
 def test_chance_keeps_nothing() -> None:
     kept = 0
     for seed in range(20):

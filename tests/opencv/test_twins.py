@@ -345,6 +345,7 @@ def test_data_never_raises(twin: Callable, points: np.ndarray) -> None:
         assert mask.dtype == np.uint8
 
 
+@pytest.mark.slow  # chance needs many draws
 def test_only_outliers_keep_nothing() -> None:
     draws = [np.random.default_rng(seed).uniform(0, 600, (2, 300, 2)) for seed in range(20)]
     answers = {name: [twin(*points) for points in draws] for name, twin in TWINS.items()}

@@ -118,6 +118,7 @@ def test_a_killed_command_leaves_no_workers(image_folder: Path, tmp_path: Path) 
     assert [path for path in workers if path.exists()] == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_dead_worker_is_one_line_and_the_run_goes_on_later(image_folder: Path, tmp_path: Path) -> None:
     done = run_killing("min(children(os.getpid()))", image_folder, tmp_path / "out.jsonl")
