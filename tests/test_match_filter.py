@@ -146,13 +146,13 @@ def test_threshold_moves_the_mask_only(scene: Scene, model_file: Path) -> None:
     assert tight.num_inliers < run(scene, model_file).num_inliers < loose.num_inliers
 
 
-HARD = make_scene(right=60, wrong=240, noise_px=0.8)
+NOISY = make_scene(right=60, wrong=240, noise_px=0.8)
 
 
 @pytest.fixture(scope="module")
-def hard(model_file: Path) -> dict[bool, FilterResult]:
-    """Answers to a hard scene with the defaults: with intrinsics, and without, as where a size is to help."""
-    return {False: run(HARD, model_file), True: run(HARD, model_file, K1=None)}
+def noisy(model_file: Path) -> dict[bool, FilterResult]:
+    """Answers to a noisy scene with the defaults: with intrinsics, and without, as where a size is to help."""
+    return {False: run(NOISY, model_file), True: run(NOISY, model_file, K1=None)}
 
 
 @pytest.mark.parametrize(
@@ -177,8 +177,8 @@ def hard(model_file: Path) -> dict[bool, FilterResult]:
     ],
     ids=lambda change: "-".join(change),
 )
-def test_every_option_changes_the_answer(change: dict, hard: dict[bool, FilterResult], model_file: Path) -> None:
-    one, other = hard["size" in str(change)], run(HARD, model_file, **change)
+def test_every_option_changes_the_answer(change: dict, noisy: dict[bool, FilterResult], model_file: Path) -> None:
+    one, other = noisy["size" in str(change)], run(NOISY, model_file, **change)
     assert one.E is not None
     assert other.E is None or not np.array_equal(one.E, other.E)
 
