@@ -89,6 +89,7 @@ def test_nearest_face_wins(scene):
         assert scene.visible_surface(faces, camera, x, y)[0].tolist() == expected
 
 
+@pytest.mark.slow
 def test_the_pair_is_hard(scene):
     """Between 8 and 20 % of the raw matches join images of the same surface point."""
     images = [cv2.imread(str(EXAMPLES / "images" / name), cv2.IMREAD_GRAYSCALE) for name in ("left.jpg", "right.jpg")]

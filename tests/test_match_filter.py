@@ -376,6 +376,7 @@ def test_match_images_in_pixels_of_the_originals(
     assert found.result.info["assumptions"][0].endswith("guessed from the image size")
 
 
+@pytest.mark.slow
 def test_match_images_finds_4000_rootsift_keypoints_unless_told_otherwise(
     photographs: tuple[np.ndarray, np.ndarray], model_file: Path
 ) -> None:

@@ -68,6 +68,7 @@ def in_process(tmp_path: Path, threads: int, *, fork: bool = False) -> list[dict
     return answers
 
 
+@pytest.mark.slow
 def test_sixteen_threads_share_one_filter() -> None:
     match_filter = MatchFilter()
     scenes = [make_scene(seed=seed, right=80 + 20 * (seed % 3)) for seed in range(THREADS)]
@@ -96,6 +97,7 @@ def test_number_of_threads_changes_nothing_that_matters(tmp_path: Path) -> None:
     assert one["mask"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_child_goes_on_with_the_open_session(tmp_path: Path) -> None:
     parent, child = in_process(tmp_path, 2, fork=True)

@@ -56,6 +56,7 @@ def test_broken_answers_of_twins_are_noticed() -> None:
     assert broken_essential(np.diag([1.0, 1.0, 0.1])) != []
 
 
+@pytest.mark.slow
 def test_command_prints_what_was_tried(model_file, capsys, monkeypatch) -> None:
     assert bad_input.main(["--model", str(model_file), "--rounds", "1"]) == 0
     out = capsys.readouterr().out

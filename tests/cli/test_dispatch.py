@@ -116,6 +116,7 @@ def kept_of(capsys: pytest.CaptureFixture[str], *images: str) -> int:
     return int(capsys.readouterr().out.splitlines()[2].split(" matches in, ")[1].split(" kept")[0])
 
 
+@pytest.mark.slow
 def test_sixteen_bit_files_keep_their_matches(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """10 bits, thermal cameras, 8 bits in 16: about as many matches as of the picture itself."""
     pictures = {name: cv2.imread(path, cv2.IMREAD_GRAYSCALE) for name, path in (("left", LEFT), ("right", RIGHT))}

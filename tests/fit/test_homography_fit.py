@@ -94,6 +94,7 @@ def test_many_wrong_matches(right: int, wrong: int, seed: int) -> None:
     assert found.inlier[~inlier].mean() < 0.02
 
 
+@pytest.mark.slow
 def test_closer_to_the_truth_than_opencv_on_average() -> None:
     """Right matches of a tenth of a pixel to two: the errors of real keypoints have such tails."""
     ours, theirs = [], []
@@ -195,6 +196,7 @@ def test_frames_find_what_sampling_does_not() -> None:
     assert without is None or without.inlier[inlier].mean() < 0.5
 
 
+@pytest.mark.slow
 def test_small_object_is_found_by_neighbours() -> None:
     found = 0
     for seed in range(10):

@@ -75,6 +75,7 @@ def test_another_resolution_is_refused_by_name(value: object, error: type[Except
         filter_matches(SCENE.points1, SCENE.points2, None, K1=K, resolution=value)
 
 
+@pytest.mark.slow
 def test_enlarged_photographs_keep_their_matches() -> None:
     images = [cv2.imread(str(EXAMPLE / name)) for name in ("left.jpg", "right.jpg")]
     truth = json.loads((EXAMPLE / "pair.json").read_text())

@@ -76,6 +76,7 @@ def test_poses_are_true_with_the_default_features(image_folder, views, tmp_path)
         assert pose_error_deg(row["R"], row["t"], R, view2.t - R @ view1.t) < 2.0
 
 
+@pytest.mark.slow
 def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
     factor = 2.5
     large = [cv2.resize(view.image, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) for view in views[:2]]
@@ -93,6 +94,7 @@ def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
     assert row["num_inliers"] == alone.result.num_inliers > strict.result.num_inliers
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_rows(image_folder, tmp_path, expected):
     assert run(image_folder, tmp_path / "out.jsonl", "-j", 2) == 0
     assert (tmp_path / "out.jsonl").read_text() == expected
@@ -209,6 +211,7 @@ cli.main(sys.argv[1:])
 """
 
 
+@pytest.mark.slow
 def test_kill_in_the_middle_loses_nothing(image_folder, tmp_path, expected, capsys):
     """kill -9 after two rows: the second run does the others only, and gives the same file."""
     output = tmp_path / "out.jsonl"
@@ -285,6 +288,7 @@ def test_a_missing_package_is_told_before_the_work(
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.slow
 def test_full_disk_is_one_line_and_the_run_goes_on_later(image_folder, tmp_path, expected):
     """A limit on the size of files stands for the full disk: the output does not fit, the rows are kept."""
     output = tmp_path / "out.jsonl"
@@ -334,6 +338,7 @@ def test_colmap_output_goes_through_the_mapper(image_folder, tmp_path):
     assert max(model.num_reg_images() for model in models.values()) == 4
 
 
+@pytest.mark.slow
 def test_images_of_another_size_are_named_and_matched_without_K(image_folder, tmp_path, capsys):
     image = cv2.imread(str(image_folder / "view00.png"))
     cv2.imwrite(str(image_folder / "view00.png"), cv2.rotate(image, cv2.ROTATE_90_CLOCKWISE))
@@ -375,6 +380,7 @@ def photographs(tmp_path, views):
     return folder
 
 
+@pytest.mark.slow
 def test_the_focal_length_is_that_of_the_exif_data(photographs, tmp_path):
     words = ["folder", str(photographs), *FEATURES, "-q", "-o"]
     assert cli.main([*words, str(tmp_path / "out.jsonl")]) == 0

@@ -49,7 +49,7 @@ def test_one_worker_reads_a_task_when_it_is_done_with_the_last() -> None:
             assert len(read) == k + 1
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_error_of_the_source_comes_through(count: int) -> None:
     def tasks():
         yield from broken_images(5)
@@ -59,6 +59,7 @@ def test_an_error_of_the_source_comes_through(count: int) -> None:
         list(workers.map("extract", tasks()))
 
 
+@pytest.mark.slow
 def test_a_driver_that_stops_early_leaves_no_worker_and_no_warning(recwarn: pytest.WarningsRecorder) -> None:
     with Workers({}, 2) as workers:
         next(workers.map("extract", broken_images(100)))
