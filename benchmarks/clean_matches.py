@@ -6,8 +6,8 @@ one thread, and its mapper runs on what each of them keeps.
 
     python -m benchmarks.clean_matches [FOLDER] [--views 8] [--repeats 3]
 
-Times are sums over the pairs, of the best of the repeats each; the target is three times COLMAP's own, with no fewer
-points. The filter knows what the database holds: intrinsics, keypoint sizes and angles, descriptors.
+Times are the processor's, sums over the pairs of the least of the repeats; the target is three times COLMAP's own, with
+no fewer points. The filter knows what the database holds: intrinsics, keypoint sizes and angles, descriptors.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Verification:
 
     Attributes:
         name: whose. pairs: with a geometry. matches: kept, over all pairs.
-        ms: sum over the pairs. images, points: of the largest model that COLMAP's mapper makes of what it kept.
+        ms: processor time, sum over the pairs. images, points: of the largest model that COLMAP's mapper makes of what it kept.
     """
 
     name: str
@@ -128,14 +128,14 @@ def compare(
 
 
 def in_turn(calls: dict[str, Callable[[], Any]], repeats: int) -> tuple[dict[str, Any], dict[str, float]]:
-    """Answers and shortest durations, ms, of calls that take turns, after one that warms up."""
+    """Answers and least processor times, ms, of calls that take turns, after one that warms up."""
     answers, best = {}, dict.fromkeys(calls, float("inf"))
     for turn in range(repeats + 1):
         for name, call in calls.items():
-            started = time.perf_counter()
+            started = time.process_time()
             answers[name] = call()
             if turn:
-                best[name] = min(best[name], 1e3 * (time.perf_counter() - started))
+                best[name] = min(best[name], 1e3 * (time.process_time() - started))
     return answers, best
 
 
