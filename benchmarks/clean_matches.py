@@ -42,8 +42,8 @@ class Verification:
     """What one verification of the clean matches took and left.
 
     Attributes:
-        name: whose. pairs: with a geometry. matches: kept, over all pairs.
-        ms: processor time, sum over the pairs. images, points: of the largest model that COLMAP's mapper makes of what it kept.
+        name: whose. pairs: with a geometry. matches: kept, over all pairs. ms: processor time, over all pairs.
+        images, points: of the largest model that COLMAP's mapper makes of what it kept.
     """
 
     name: str
