@@ -433,7 +433,6 @@ def filter_matches(
         BackendError: no runtime can be started, or it refused.
         ImportError: ``method="poselib"`` without PoseLib.
     """
-    K1 = _shared_intrinsics(K, K1, K2)
     match_filter = MatchFilter(
         threshold=threshold,
         keep_precision=keep_precision,
@@ -447,8 +446,20 @@ def filter_matches(
         backend=backend,
         seed=seed,
     )
-    pair = MatchPair(kp1, kp2, matches, K1, K2, dist1, dist2, size1, size2, attributes, resolution)
-    return match_filter.filter_many([pair])[0]
+    return match_filter.filter(
+        kp1,
+        kp2,
+        matches,
+        K1=K1,
+        K2=K2,
+        dist1=dist1,
+        dist2=dist2,
+        size1=size1,
+        size2=size2,
+        attributes=attributes,
+        K=K,
+        resolution=resolution,
+    )
 
 
 def filter_many(pairs: Iterable[MatchPair | tuple[Any, Any, Any]], **options: Any) -> list[FilterResult]:

@@ -140,6 +140,7 @@ def test_only_outliers(match_filter: MatchFilter, intrinsics: Any, seed: int, kn
     assert_no_model(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("intrinsics", INTRINSICS)
 @pytest.mark.parametrize("method", ["prosac", "magsac", "ransac"])
 def test_of_only_outliers_one_estimator_alone_makes_nothing_to_use(

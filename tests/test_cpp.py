@@ -79,12 +79,14 @@ def program(build: Path, name: str) -> Path:
     return next(path for path in found if path.is_file() and os.access(path, os.X_OK))
 
 
+@pytest.mark.slow
 def test_own_tests_of_the_library(build):
     done = run("ctest", "--test-dir", build, "--output-on-failure", "-C", "Release")
     assert done.returncode == 0, done.stdout + done.stderr
     assert "100% tests passed" in done.stdout
 
 
+@pytest.mark.slow
 def test_answers_are_those_of_python_on_this_machine(build, tmp_path):
     """With the same OpenCV in every bit that counts; else as another seed would have it."""
     shutil.copytree(ROOT / "tests" / "golden" / "inputs", tmp_path / "inputs")
@@ -118,6 +120,7 @@ def camera() -> str:
     return ",".join(repr(float(value)) for value in (K[0][0], K[1][1], K[0][2], K[1][2]))
 
 
+@pytest.mark.slow
 def test_tool_answers_in_words_and_json(build):
     tool = program(build, "mgca_match")
     images = (IMAGES / "left.jpg", IMAGES / "right.jpg", "--model", mgca_filter.model_path())
@@ -133,6 +136,7 @@ def test_tool_answers_in_words_and_json(build):
     assert "guessed from the image size" in guessed.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -153,6 +157,7 @@ def test_tool_names_what_is_wrong(build, words, message):
     assert message in done.stderr
 
 
+@pytest.mark.slow
 def test_odometry_times_every_frame(build, image_folder, tmp_path):
     """The example, built on the installed library."""
     prefix, examples = tmp_path / "prefix", tmp_path / "examples"
@@ -168,6 +173,7 @@ def test_odometry_times_every_frame(build, image_folder, tmp_path):
     assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
 
 
+@pytest.mark.slow
 def test_opencv_4_alone_is_refused(build, tmp_path):
     version = re.search(r"OpenCV ([\d.]+)", run(program(build, "test_golden"), *golden_arguments()).stdout)
     assert version is not None

@@ -43,6 +43,7 @@ def pair() -> dict:
     return json.loads((EXAMPLES / "images" / "pair.json").read_text())
 
 
+@pytest.mark.slow  # ten seconds of rays
 def test_render_pair_gives_the_committed_images_again(tmp_path, pair):
     run_example("render_pair.py", "--out", str(tmp_path), "--supersampling", "3")
     again = json.loads((tmp_path / "pair.json").read_text())
@@ -88,6 +89,7 @@ def test_nearest_face_wins(scene):
         assert scene.visible_surface(faces, camera, x, y)[0].tolist() == expected
 
 
+@pytest.mark.slow
 def test_the_pair_is_hard(scene):
     """Between 8 and 20 % of the raw matches join images of the same surface point."""
     images = [cv2.imread(str(EXAMPLES / "images" / name), cv2.IMREAD_GRAYSCALE) for name in ("left.jpg", "right.jpg")]
@@ -114,6 +116,7 @@ def test_replacing_find_essential_mat_finds_the_pose():
     assert float(error.group(1)) < 2.0
 
 
+@pytest.mark.slow
 def test_before_after_draws_a_picture(tmp_path):
     path = tmp_path / "new folder" / "picture.png"
     assert "RANSAC alone" in run_example("before_after.py", "--out", str(path))

@@ -51,6 +51,7 @@ def wheel(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_wheel_holds_the_model_its_card_and_the_type_marker(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert "mgca_filter/py.typed" in names
@@ -61,6 +62,7 @@ def test_wheel_holds_the_model_its_card_and_the_type_marker(wheel):
     assert not any(name.startswith(("tests/", "examples/", "export/", "benchmarks/")) for name in names)
 
 
+@pytest.mark.slow
 def test_wheel_alone_runs_the_command_outside_the_source_tree(wheel, tmp_path):
     """Zip imports cannot open the model file, hence unpacked; dependencies come from this environment."""
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")

@@ -31,19 +31,18 @@ from conftest import K, make_scene
 from mgca_filter import MatchFilter
 match_filter = MatchFilter()
 def answers():
-    scenes = [make_scene(seed=seed, right=300 * seed + 60, wrong=200) for seed in range(4)]
+    scenes = [make_scene(seed=seed, right=300 * seed + 60, wrong=200) for seed in range(3)]
     results = [match_filter.filter(s.points1, s.points2, None, K1=K, attributes=s.attributes) for s in scenes]
     return np.concatenate([r.info["logits"] for r in results]), np.concatenate([r.mask for r in results])
 logits, mask = answers()
-if sys.argv[3] == "fork":
+np.savez(sys.argv[2], logits=logits, mask=mask)
+if len(sys.argv) > 3:
     child = os.fork()
     if child == 0:
         logits, mask = answers()
-        np.savez(sys.argv[2], logits=logits, mask=mask)
+        np.savez(sys.argv[3], logits=logits, mask=mask)
         os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
-else:
-    np.savez(sys.argv[2], logits=logits, mask=mask)
 """
 
 
@@ -56,19 +55,23 @@ def assert_same_bits(one: FilterResult, other: FilterResult) -> None:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
 
 
-def in_process(tmp_path: Path, threads: int, how: str = "plain") -> dict[str, np.ndarray]:
-    """Logits and masks of four scenes, computed in a process with that many threads, or in its forked child."""
-    path = tmp_path / f"{how}{threads}.npz"
+def in_process(tmp_path: Path, threads: int, *, fork: bool = False) -> list[dict[str, np.ndarray]]:
+    """Logits and masks of three scenes, computed in a process with that many threads, and in its forked child."""
+    paths = [tmp_path / f"{who}{threads}.npz" for who in ("parent", "child")[: 1 + fork]]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "MGCA_FILTER_NUM_THREADS": str(threads)}
-    command = [sys.executable, "-c", ANSWER_IN_PROCESS, str(ROOT / "tests"), str(path), how]
+    command = [sys.executable, "-c", ANSWER_IN_PROCESS, str(ROOT / "tests"), *map(str, paths)]
     subprocess.run(command, env=environment, check=True, timeout=120)
-    with np.load(path) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    answers = []
+    for path in paths:
+        with np.load(path) as arrays:
+            answers.append({name: arrays[name] for name in arrays.files})
+    return answers
 
 
+@pytest.mark.slow
 def test_sixteen_threads_share_one_filter() -> None:
     match_filter = MatchFilter()
-    scenes = [make_scene(seed=seed, right=80 + 20 * (seed % 3)) for seed in range(2 * THREADS)]
+    scenes = [make_scene(seed=seed, right=80 + 20 * (seed % 3)) for seed in range(THREADS)]
     with ThreadPoolExecutor(THREADS) as pool:
         together = list(pool.map(lambda scene: answer(match_filter, scene), scenes))
     for scene, result in zip(scenes, together):
@@ -86,16 +89,18 @@ def test_filter_travels_to_other_processes(start: str) -> None:
     assert_same_bits(result, answer(match_filter, scene))
 
 
+@pytest.mark.slow
 def test_number_of_threads_changes_nothing_that_matters(tmp_path: Path) -> None:
-    one, four = in_process(tmp_path, 1), in_process(tmp_path, 4)
+    (one,), (four,) = in_process(tmp_path, 1), in_process(tmp_path, 4)
     assert np.abs(one["logits"] - four["logits"]).max() < 1e-4
     np.testing.assert_array_equal(one["mask"], four["mask"])
     assert one["mask"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 def test_a_forked_child_goes_on_with_the_open_session(tmp_path: Path) -> None:
-    child, parent = in_process(tmp_path, 2, "fork"), in_process(tmp_path, 2)
+    parent, child = in_process(tmp_path, 2, fork=True)
     np.testing.assert_array_equal(child["mask"], parent["mask"])
     np.testing.assert_array_equal(child["logits"], parent["logits"])
 

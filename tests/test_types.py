@@ -46,6 +46,7 @@ def complaints(path: Path) -> list[str]:
     return [str(item["range"]["start"]["line"]) for item in report["generalDiagnostics"] if item["severity"] == "error"]
 
 
+@pytest.mark.slow
 def test_pyright_passes_right_calls_and_marks_wrong_ones(tmp_path: Path) -> None:
     pytest.importorskip("pyright")
     script = tmp_path / "calls.py"

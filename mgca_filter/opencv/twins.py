@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import cv2
@@ -58,8 +58,20 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _SOLVERS = (cv2.FM_7POINT, cv2.FM_8POINT)
 # Bound at import, like those of the robust fit: the names in cv2 may be swapped.
 _find_essential_mat, _find_fundamental_mat = cv2.findEssentialMat, cv2.findFundamentalMat
-_find_homography = cv2.findHomography
-_estimate_affine, _estimate_similarity = cv2.estimateAffine2D, cv2.estimateAffinePartial2D
+
+
+@dataclass(frozen=True)
+class _Family:
+    """A family of plane maps: OpenCV's own function for it, to which fewer points than ``fewest`` go as they are."""
+
+    name: str
+    by_opencv: Callable[..., Any]
+    fewest: int
+
+
+_HOMOGRAPHY = _Family("homography", cv2.findHomography, 5)
+_AFFINE = _Family("affine", cv2.estimateAffine2D, 4)
+_SIMILARITY = _Family("similarity", cv2.estimateAffinePartial2D, 3)
 
 # Points of a map that extend over less than this are normalised; an image of this many pixels stands in for theirs.
 _FEWEST_PIXELS, _USUAL_PIXELS = 10.0, 1000.0
@@ -321,65 +333,55 @@ def _homography_of_points(
     maxIters: int = 2000,
     confidence: float = 0.995,
 ) -> Answer:
-    if method not in _ROBUST_METHODS or _is_opencvs_own(srcPoints, dstPoints, 5):
+    if method not in _ROBUST_METHODS or _is_opencvs_own(srcPoints, dstPoints, _HOMOGRAPHY):
         limits = (ransacReprojThreshold, mask, maxIters, confidence)
-        return _with_mask(_find_homography(srcPoints, dstPoints, method, *limits), srcPoints)
+        return _with_mask(_HOMOGRAPHY.by_opencv(srcPoints, dstPoints, method, *limits), srcPoints)
     threshold = ransacReprojThreshold if ransacReprojThreshold > 0 else 3.0
     options = _read_fit(confidence, threshold, maxIters)
-    return _fit_map("homography", srcPoints, dstPoints, options, method == cv2.LMEDS, mask)
+    return _fit_map(_HOMOGRAPHY, srcPoints, dstPoints, options, method == cv2.LMEDS, mask)
 
 
 def _homography_by_params(srcPoints: Any, dstPoints: Any, params: cv2.UsacParams, mask: Any = None) -> Answer:
-    if _is_opencvs_own(srcPoints, dstPoints, 5):
-        return _with_mask(_find_homography(srcPoints, dstPoints, params, mask), srcPoints)
-    return _fit_map("homography", srcPoints, dstPoints, _read_params(params), False, mask)
-
-
-def _affine_of_points(
-    from_: Any,
-    to: Any,
-    inliers: Any = None,
-    method: int = cv2.RANSAC,
-    ransacReprojThreshold: float = 3.0,
-    maxIters: int = 2000,
-    confidence: float = 0.99,
-    refineIters: int = 10,
-) -> Answer:
-    if method not in _ROBUST_METHODS or _is_opencvs_own(from_, to, 4):
-        limits = (ransacReprojThreshold, maxIters, confidence, refineIters)
-        return _with_mask(_estimate_affine(from_, to, inliers, method, *limits), from_)
-    options = _read_fit(confidence, ransacReprojThreshold, maxIters)
-    return _fit_map("affine", from_, to, options, method == cv2.LMEDS, inliers)
+    return _map_by_params(_HOMOGRAPHY, srcPoints, dstPoints, params, mask)
 
 
 def _affine_by_params(pts1: Any, pts2: Any, params: cv2.UsacParams, inliers: Any = None) -> Answer:
-    if _is_opencvs_own(pts1, pts2, 4):
-        return _with_mask(_estimate_affine(pts1, pts2, params, inliers), pts1)
-    return _fit_map("affine", pts1, pts2, _read_params(params), False, inliers)
+    return _map_by_params(_AFFINE, pts1, pts2, params, inliers)
 
 
-def _similarity_of_points(
-    from_: Any,
-    to: Any,
-    inliers: Any = None,
-    method: int = cv2.RANSAC,
-    ransacReprojThreshold: float = 3.0,
-    maxIters: int = 2000,
-    confidence: float = 0.99,
-    refineIters: int = 10,
-) -> Answer:
-    if method not in _ROBUST_METHODS or _is_opencvs_own(from_, to, 3):
-        limits = (ransacReprojThreshold, maxIters, confidence, refineIters)
-        return _with_mask(_estimate_similarity(from_, to, inliers, method, *limits), from_)
-    options = _read_fit(confidence, ransacReprojThreshold, maxIters)
-    return _fit_map("similarity", from_, to, options, method == cv2.LMEDS, inliers)
+def _map_by_params(family: _Family, points1: Any, points2: Any, params: cv2.UsacParams, mask: Any) -> Answer:
+    if _is_opencvs_own(points1, points2, family):
+        return _with_mask(family.by_opencv(points1, points2, params, mask), points1)
+    return _fit_map(family, points1, points2, _read_params(params), False, mask)
 
 
-def _is_opencvs_own(points1: Any, points2: Any, fewest: int) -> bool:
-    """True for points that are fewer than ``fewest``, or in three coordinates."""
+def _affine_of_points(family: _Family) -> Callable[..., Answer]:
+    """The overload with scalar arguments, which affine maps and similarities share."""
+
+    def of_points(
+        from_: Any,
+        to: Any,
+        inliers: Any = None,
+        method: int = cv2.RANSAC,
+        ransacReprojThreshold: float = 3.0,
+        maxIters: int = 2000,
+        confidence: float = 0.99,
+        refineIters: int = 10,
+    ) -> Answer:
+        if method not in _ROBUST_METHODS or _is_opencvs_own(from_, to, family):
+            limits = (ransacReprojThreshold, maxIters, confidence, refineIters)
+            return _with_mask(family.by_opencv(from_, to, inliers, method, *limits), from_)
+        options = _read_fit(confidence, ransacReprojThreshold, maxIters)
+        return _fit_map(family, from_, to, options, method == cv2.LMEDS, inliers)
+
+    return of_points
+
+
+def _is_opencvs_own(points1: Any, points2: Any, family: _Family) -> bool:
+    """True for points that are fewer than the family's fewest, or in three coordinates."""
     shapes = [np.shape(points) for points in (points1, points2)]
     return any(len(shape) > 1 and shape[-1] == 3 and 2 not in shape for shape in shapes) or any(
-        int(np.prod(shape)) < 2 * fewest for shape in shapes
+        int(np.prod(shape)) < 2 * family.fewest for shape in shapes
     )
 
 
@@ -446,7 +448,7 @@ def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: A
 
 
 @np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
-def _fit_map(family: str, points1: Any, points2: Any, options: FilterOptions, lmeds: bool, mask: Any) -> Answer:
+def _fit_map(family: _Family, points1: Any, points2: Any, options: FilterOptions, lmeds: bool, mask: Any) -> Answer:
     """A map of a family, (3, 3) or (2, 3), or None where nothing can be found, and the mask (N, 1)."""
     points1, points2 = _read_points(points1, points2)
     T1, T2 = _to_comparable_pixels(points1, points2)
@@ -454,15 +456,15 @@ def _fit_map(family: str, points1: Any, points2: Any, options: FilterOptions, lm
     x1, x2 = transfer(points1, T1), transfer(points2, T2)
     if lmeds:
         threshold = max(_LMEDS_THRESHOLD_SHARE * _extent(x2), np.finfo(np.float64).tiny)
-    scored = _run(MatchPair(x1, x2, None), replace(options, threshold=1.0, method="none"), family)
-    found = _fit_in_pixels(family, np.hstack([x1, x2]), scored.scores.astype(np.float64), threshold, options)
+    scored = _run(MatchPair(x1, x2, None), replace(options, threshold=1.0, method="none"), family.name)
+    found = _fit_in_pixels(family.name, np.hstack([x1, x2]), scored.scores.astype(np.float64), threshold, options)
     if found is None:
         return _map_by_opencv(family, points1, points2), _as_opencv_mask(np.zeros(len(points1), dtype=bool), mask)
     fit, meaningful = found
     distance = np.linalg.norm(transfer(x1, fit.H) - x2, axis=1)
     inlier = (distance < threshold) & np.isfinite(fit.distance) & meaningful
     H = scaled_homography(np.linalg.inv(T2) @ fit.H @ T1)
-    return H if family == "homography" else H[:2], _as_opencv_mask(inlier, mask)
+    return H if family is _HOMOGRAPHY else H[:2], _as_opencv_mask(inlier, mask)
 
 
 def _fit_in_pixels(
@@ -510,13 +512,11 @@ def _to_comparable_pixels(points1: Array, points2: Array) -> tuple[Array, Array]
     return np.diag([zoom1, zoom1, 1.0]), np.diag([zoom2, zoom2, 1.0])
 
 
-def _map_by_opencv(family: str, points1: Array, points2: Array) -> Array | None:
+def _map_by_opencv(family: _Family, points1: Array, points2: Array) -> Array | None:
     """OpenCV's own map where ours is none."""
     usable = np.isfinite(points1).all(axis=1) & np.isfinite(points2).all(axis=1)
-    find: dict[str, Callable[..., Any]] = {"homography": _find_homography}
-    find |= {"affine": _estimate_affine, "similarity": _estimate_similarity}
     try:
-        M, _ = find[family](points1[usable], points2[usable], method=cv2.RANSAC)
+        M, _ = family.by_opencv(points1[usable], points2[usable], method=cv2.RANSAC)
     except cv2.error:
         return None
     return None if M is None or np.size(M) == 0 or not np.isfinite(M).all() else np.asarray(M, dtype=np.float64)
@@ -597,5 +597,5 @@ _ESSENTIAL_OVERLOADS = (
 )
 _FUNDAMENTAL_OVERLOADS = (_fundamental_with_limit, _fundamental_of_points, _fundamental_by_params)
 _HOMOGRAPHY_OVERLOADS = (_homography_of_points, _homography_by_params)
-_AFFINE_OVERLOADS = (_affine_of_points, _affine_by_params)
-_SIMILARITY_OVERLOADS = (_similarity_of_points,)
+_AFFINE_OVERLOADS = (_affine_of_points(_AFFINE), _affine_by_params)
+_SIMILARITY_OVERLOADS = (_affine_of_points(_SIMILARITY),)

@@ -78,6 +78,7 @@ def test_pairs_without_their_photographs_are_left_out(photographs: tuple[Path, P
         photographed(folder, SceneBundle(path))
 
 
+@pytest.mark.slow
 def test_rendered_views_know_their_pose(world: ImageSet, textures: Path) -> None:
     (pair,) = world.matched(detectors.make_detector("sift"))
     right = symmetric_epipolar_distance_squared(pair.correspondences, pair.E) < 1e-4
@@ -87,6 +88,7 @@ def test_rendered_views_know_their_pose(world: ImageSet, textures: Path) -> None
     assert not np.array_equal(rendered(textures, 1, seed=1).pairs[0].t, pair.t)
 
 
+@pytest.mark.slow
 def test_detector_command_has_a_row_for_every_kind_of_input(
     photographs: tuple[Path, Path],
     world: ImageSet,

@@ -179,6 +179,7 @@ def bundles(tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_command_prints_all_tables_and_takes_known_results_from_the_store(
     bundles: Path, model_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

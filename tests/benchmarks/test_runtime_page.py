@@ -37,6 +37,7 @@ def test_every_command_has_its_place_on_the_page(page: Path, monkeypatch: pytest
     assert page.read_text(encoding="utf-8") == before.replace(" --bundles B |", " |")
 
 
+@pytest.mark.slow
 def test_the_commands_exist_and_a_failure_ends_the_run() -> None:
     words: dict[tuple[str, ...], set[str]] = {}
     for command in runtime.COMMANDS.values():

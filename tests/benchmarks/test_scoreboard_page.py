@@ -79,6 +79,7 @@ def test_the_filter_stands_beside_the_strongest_baselines_by_scene_and_difficult
     ]
 
 
+@pytest.mark.slow
 def test_tables_and_figures_are_written(tmp_path: Path):
     pytest.importorskip("matplotlib")
     (tmp_path / "mgca_filter" / "models").mkdir(parents=True)

@@ -347,6 +347,7 @@ def test_network_rows_run_without_the_robust_fit(scene, model_file, pair):
 # Runs
 
 
+@pytest.mark.slow
 def test_workers_do_not_change_the_numbers(folder, model_file):
     methods = [parse_method(name, str(model_file)) for name in (PROSAC, "NN + PoseLib 0.75 px", "product")]
     selections = select_pairs(folder)

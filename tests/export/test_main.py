@@ -35,6 +35,7 @@ def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ONNXSLIM_MAX_ITER", "1")  # further rounds of onnxslim leave the answer and take their time
 
 
+@pytest.mark.slow
 def test_files_are_written_listed_and_compared(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -59,6 +60,7 @@ def test_files_are_written_listed_and_compared(
     assert calibration != {"scale": 1.0, "offset": 0.0}
 
 
+@pytest.mark.slow
 def test_files_that_disagree_end_in_failure(
     weights: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

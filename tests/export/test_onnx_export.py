@@ -165,6 +165,7 @@ def test_variants_export_as_well(tmp_path, changes, counts):
     assert all(row.logit_difference < 1e-3 for row in rows), parity.format_parity(rows)
 
 
+@pytest.mark.slow
 def test_three_stages_export_as_well(tmp_path, monkeypatch):
     monkeypatch.setenv(*ONE_ROUND)
     network = settled_network(dataclasses.replace(CONFIG, stages=3, channels=8))

@@ -131,6 +131,7 @@ def report(tmp_path_factory):
     return write_folder_report(path, ROWS, title="my folder", thumbnails=thumbnails, command="a7c3f")
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_the_page_runs_under_its_own_policy(report, tmp_path):
     page = open_page(report, tmp_path)
@@ -147,6 +148,7 @@ def seen(report, tmp_path_factory):
     return ask(report, tmp_path_factory.mktemp("asked"), "folder_checks.js", {"matrix": None, "table": None})
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_table_sorts_and_filters(seen):
     seen = seen["table"]
@@ -160,6 +162,7 @@ def test_table_sorts_and_filters(seen):
     assert seen["words"] == "2 of 2 pairs shown."
 
 
+@pytest.mark.slow
 @needs_chromium
 def test_matrix_links_and_keys(seen):
     seen = seen["matrix"]

@@ -15,7 +15,7 @@ from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import sampson_distance
 from mgca_filter.html_report import Baseline, Truth, write_pair_report
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.slow]
 SCENE = make_scene(seed=3, right=80, wrong=40)
 CHECKS = "pair_checks.js"
 NAME = "<img src=x onerror='document.title=1'>.jpg"

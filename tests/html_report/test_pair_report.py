@@ -261,6 +261,7 @@ def test_confidence_of_a_result_reaches_the_report(written, result):
 def test_command_line_writes_the_report(tmp_path, model_file, capsys):
     path = tmp_path / "pair.html"
     words = [str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg"), "--model", str(model_file), "--compare", "-q"]
+    words += ["--max-keypoints", "1000"]
     assert cli.main([*words, "--K", "820,820,511.5,383.5", "--html", str(path)]) == 0
     data = data_of(path.read_text(encoding="utf-8"))
     assert data["names"] == ["left.jpg", "right.jpg"]

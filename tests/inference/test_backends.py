@@ -294,7 +294,7 @@ if sys.argv[1] == "torch":
 
 
 @needs_fork
-@pytest.mark.parametrize("name", ["onnxruntime", "torch"])
+@pytest.mark.parametrize("name", ["onnxruntime", pytest.param("torch", marks=pytest.mark.slow)])
 def test_a_forked_child_answers_like_its_parent(name: str) -> None:
     pytest.importorskip(name)
     environment = {**os.environ, "MGCA_FILTER_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

@@ -75,16 +75,17 @@ def test_another_resolution_is_refused_by_name(value: object, error: type[Except
         filter_matches(SCENE.points1, SCENE.points2, None, K1=K, resolution=value)
 
 
+@pytest.mark.slow
 def test_enlarged_photographs_keep_their_matches() -> None:
     images = [cv2.imread(str(EXAMPLE / name)) for name in ("left.jpg", "right.jpg")]
     truth = json.loads((EXAMPLE / "pair.json").read_text())
     counts = {}
-    for factor in (1, 2, 4, 8):
+    for factor in (1, 2, 8):
         large = [cv2.resize(i, None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC) for i in images]
         K_large = np.array(
             [[820.0 * factor, 0, 512 * factor - 0.5], [0, 820.0 * factor, 384 * factor - 0.5], [0, 0, 1]]
         )
-        result = match_images(*large, K1=K_large).result
+        result = match_images(*large, K1=K_large, max_keypoints=2000).result
         counts[factor] = result.num_inliers
         assert pose_error_deg(result.R, result.t, np.array(truth["R"]), np.array(truth["t"])) < 1.0
     assert min(counts.values()) > 0.9 * counts[1]

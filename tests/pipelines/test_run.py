@@ -49,7 +49,7 @@ def test_one_worker_reads_a_task_when_it_is_done_with_the_last() -> None:
             assert len(read) == k + 1
 
 
-@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_error_of_the_source_comes_through(count: int) -> None:
     def tasks():
         yield from broken_images(5)
@@ -59,6 +59,7 @@ def test_an_error_of_the_source_comes_through(count: int) -> None:
         list(workers.map("extract", tasks()))
 
 
+@pytest.mark.slow
 def test_a_driver_that_stops_early_leaves_no_worker_and_no_warning(recwarn: pytest.WarningsRecorder) -> None:
     with Workers({}, 2) as workers:
         next(workers.map("extract", broken_images(100)))
@@ -118,6 +119,7 @@ def test_a_killed_command_leaves_no_workers(image_folder: Path, tmp_path: Path) 
     assert [path for path in workers if path.exists()] == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for processes in /proc")
 def test_a_dead_worker_is_one_line_and_the_run_goes_on_later(image_folder: Path, tmp_path: Path) -> None:
     done = run_killing("min(children(os.getpid()))", image_folder, tmp_path / "out.jsonl")

@@ -75,6 +75,7 @@ def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return [*paths, "--steps", "2", "--workers", "0", "--device", "cpu"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_table_and_does_no_row_twice(command, tmp_path, monkeypatch):
     rows = ["--rows", "baseline", "synthetic pre-training"]
     assert load_config(tmp_path / "run.toml").network == TINY

@@ -36,10 +36,11 @@ from mgca_filter.training.sources import BundleSource
 from mgca_filter.training.validation import quick_validation, select_pairs
 
 STEPS = 6
+NETWORK = dataclasses.replace(TINY, stages=1)
 CONFIG = TrainingConfig(
     name="tiny",
     seed=5,
-    network=TINY,
+    network=NETWORK,
     sampling=SamplingConfig(batch_size=2, matches=(32,), matches_weights=(1.0,), holdout_every=0, pool_batches=2),
     schedule=ScheduleConfig(steps=STEPS, warmup_steps=2, geometric_from=0.5, precision="fp32"),
 )
@@ -104,7 +105,7 @@ def test_the_run_directory_holds_logs_and_weights(whole_run):
     assert [row["step"] for row in rows(whole_run / VALIDATION)] == ["3", "6"]
     assert all(np.isfinite(float(value)) for row in rows(whole_run / LOG) for value in row.values())
     network = load_network(whole_run / loop.WEIGHTS)
-    assert network.config == TINY
+    assert network.config == NETWORK
     average = torch.load(whole_run / CHECKPOINT, weights_only=True)["average"]
     assert all(torch.equal(tensor, average[name]) for name, tensor in network.state_dict().items())
 
@@ -190,7 +191,7 @@ def test_nan_stops_the_run_and_keeps_the_batch(bundle, whole_run, tmp_path, fiel
     [
         dataclasses.replace(CONFIG, seed=6),
         dataclasses.replace(CONFIG, schedule=dataclasses.replace(CONFIG.schedule, learning_rate=1e-3)),
-        dataclasses.replace(CONFIG, network=dataclasses.replace(TINY, channels=16)),
+        dataclasses.replace(CONFIG, network=dataclasses.replace(NETWORK, channels=16)),
     ],
 )
 def test_checkpoints_of_another_config_are_refused(bundle, tmp_path, changed):
@@ -200,7 +201,7 @@ def test_checkpoints_of_another_config_are_refused(bundle, tmp_path, changed):
 
 
 def test_a_run_may_start_from_weights(bundle, tmp_path):
-    start = tiny_network(seed=8)
+    start = tiny_network(NETWORK, seed=8)
     save_network(start, tmp_path / "start.safetensors")
     run = trainer(bundle, tmp_path / "run", weights=tmp_path / "start.safetensors")
     for network in (run.network, run.average):
@@ -404,6 +405,7 @@ def assert_same_weights(run: Path, other: Path) -> None:
     assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
 
 
+@pytest.mark.slow
 def test_a_process_killed_at_any_step_resumes_to_the_same_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "LOG_EVERY", 1)
     arguments = command_line(tmp_path, "killed", 12, workers=1)

@@ -166,6 +166,7 @@ def load(path: Path) -> dict[str, np.ndarray]:
         return dict(data)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_bundle_that_workers_do_not_change(photos, tmp_path):
     command = [str(photos.folder), str(tmp_path / "out.npz"), "--pairs", "2", "--views", "2", "--seed", "1"]
     assert main([*command, "--workers", "0"]) == 0
