@@ -267,7 +267,7 @@ class MatchFilter:
         """Sentences on what may surprise about the answer."""
         remarks = []
         if verdict.info.get("mirrored"):
-            remarks.append("one of the images is mirrored: the matches agree with a plane that no camera sees so")
+            remarks.append("one of the images is mirrored: the matches agree with a view that no camera has")
         asked = self.options.keep_precision
         if (
             asked is not None

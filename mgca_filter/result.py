@@ -70,7 +70,7 @@ class FilterResult:
             where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:
             ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``translation_sigma_deg``
             (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``mirrored``
-            (True where H mirrors: one of the images was flipped, and the pair is planar without a pose),
+            (True where one of the images was flipped: there is no pose, and H mirrors where the pair is planar),
             ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of
             1.2).
     """

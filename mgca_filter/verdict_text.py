@@ -63,8 +63,8 @@ _PLANE_WITHOUT_K = (
     "command line --K fx,fy,cx,cy)."
 )
 _MIRRORED = (
-    "Use the kept matches and the homography. One of the images is mirrored: no camera sees an opaque surface from "
-    "both sides, so that there is no pose. Flip one image and match again."
+    "One of the images is mirrored: no camera sees an opaque surface from both sides, so that there is no pose. Flip "
+    "one image and match again; the kept matches, and the homography where there is one, are right as they are."
 )
 _UNSURE = 0.5
 
