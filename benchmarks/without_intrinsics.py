@@ -1,8 +1,8 @@
 """Photographs without K: how good is the pose, and how sure are the focal lengths?
 
-``python -m benchmarks.without_intrinsics [BUNDLES]``. On the pairs of scene bundles: the pose that comes without K; what F, which comes with it, would have given with the
-true K; and the pose under focal lengths that are guessed alone. ``--zooms`` enlarges image 2 about its principal point,
-as if another lens had taken it. Without bundles the pairs are made up, of which focal lengths and poses are known.
+``python -m benchmarks.without_intrinsics [BUNDLES]``, on pairs of scene bundles: the pose that comes without K; what
+F, which comes with it, would have given with the true K; and the pose under a focal length that is guessed. ``--zooms``
+enlarges image 2 about its principal point, as if another lens had taken it. Without bundles the pairs are made up.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def zoomed(pair: ScenePair, zoom: float) -> ScenePair:
         return pair
     centre = pair.K2[:2, 2]
     points2 = (pair.points2 - centre) * zoom + centre
-    inside = ((points2 >= 0) & (points2 < np.array(pair.image_size2))).all(axis=1)
+    inside = np.flatnonzero(((points2 >= 0) & (points2 < np.array(pair.image_size2))).all(axis=1))
     K2 = pair.K2.copy()
     K2[:2, :2] *= zoom
     return replace(pair, points2=points2, K2=K2).take(inside)
@@ -86,15 +86,15 @@ def make_pair(seed: int, zoom: float) -> ScenePair:
         seen = np.flatnonzero((X2[:, 2] > 0.5) & ((points2 > 0) & (points2 < np.array(SIZE))).all(axis=1))[:RIGHT]
         if len(seen) == RIGHT:
             break
-    ends = [
+    ends1, ends2 = (
         np.vstack([p[seen] + rng.normal(0, NOISE_PX, (RIGHT, 2)), rng.uniform((0, 0), SIZE, (WRONG, 2))])
         for p in (points1, points2)
-    ]
+    )
     right = np.arange(RIGHT + WRONG) < RIGHT
     ratio = np.where(right, rng.uniform(0.3, 0.85, len(right)), rng.uniform(0.7, 1.0, len(right))).astype(np.float32)
     attributes = MatchAttributes(ratio=ratio, best=np.ones(len(right), dtype=bool))
-    names = ("made up", seed, "1", "2")
-    return ScenePair(*names, *ends, K1, K2, SIZE, SIZE, R, t / np.linalg.norm(t), attributes, right)
+    pose = R, t / np.linalg.norm(t)
+    return ScenePair("made up", seed, "1", "2", ends1, ends2, K1, K2, SIZE, SIZE, *pose, attributes, right)
 
 
 def run_pair(pair: ScenePair, match_filter: MatchFilter, without_estimate: MatchFilter) -> Outcome:

@@ -235,6 +235,18 @@ def test_keep_precision_keeps_nothing_without_a_model(model_file: Path) -> None:
     assert not kept[:50].any()
 
 
+def test_keep_precision_that_keeps_nothing_is_told(
+    scene: Scene, model_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    none, some = (run(scene, model_file, keep_precision=p, effort="full") for p in (0.9999, 0.7))
+    assert not none.mask.any()
+    assert none.E is not None
+    told = f"keep_precision=0.9999 keeps no match, for the best score is {none.scores.max():.2f}"
+    assert none.info["assumptions"][-1].startswith(told)
+    assert caplog.messages == [none.info["assumptions"][-1]]
+    assert not any("keep_precision" in text for text in some.info["assumptions"])
+
+
 def test_second_intrinsics_default_to_the_first(scene: Scene, model_file: Path) -> None:
     one, other = run(scene, model_file, K1=K), run(scene, model_file, K1=K, K2=K)
     assert_same(one, other)
