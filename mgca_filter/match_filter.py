@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -12,10 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
-from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focal
+from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focals
+from .fit.mirror import judge_mirror
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge, judge_homography
-from .geometry.cameras import Fisheye
+from .geometry.cameras import Fisheye, mean_focal_length
 from .geometry.epipolar import project_to_essential
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
 from .inference.calibration import largest_set_of_precision
@@ -34,6 +36,7 @@ from .result import FilterResult, Status
 from .types import MatchesLike, MatrixLike, PointsLike, Providers, SizeLike
 
 _BATCH_PAIRS = 8
+_log = logging.getLogger("mgca_filter")
 
 
 PUBLISHED_MODELS = {"default": "mgca_small", "fast": "mgca_fast"}
@@ -212,21 +215,7 @@ class MatchFilter:
         else:
             logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
-        if job.evidence is None:
-            verdict = _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
-        else:
-            threshold_px, choice = pair.threshold_px(self.options.threshold), self._backend.metadata.choice
-            if self.options.geometry == "homography":
-                verdict = judge_homography(pair, job.evidence, threshold_px, self.options)
-            else:
-                verdict = judge(pair, job.model, job.evidence, threshold_px, choice, self.options)
-            if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
-                verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
-            if job.focal is not None and verdict.status is Status.PLANAR:
-                verdict = replace(verdict, E=None, R=None, t=None)  # a plane tells no focal length
-            found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
-            if self.options.keep_precision is not None and found:
-                verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
+        verdict = self._judge(job, scores)
         job.timings_ms["verdict"] = _milliseconds_since(started)
         return FilterResult(
             mask=verdict.mask,
@@ -245,11 +234,53 @@ class MatchFilter:
             indices=np.stack([pair.matches.index1, pair.matches.index2], axis=1),
             info={
                 **self._describe(job),
+                "assumptions": [*self._assumptions(job), *self._remarks(verdict, scores)],
                 "logits": logits,
                 "num_accepted": int(np.count_nonzero(logits > self._backend.metadata.decision_threshold)),
                 **verdict.info,
             },
         )
+
+    def _judge(self, job: _Job, scores: NDArray[np.float32]) -> Verdict:
+        """The verdict on the model, and what stays of it where nobody knows the intrinsics."""
+        pair, options = job.pair, self.options
+        if job.evidence is None:
+            return _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
+        threshold_px, choice = pair.threshold_px(options.threshold), self._backend.metadata.choice
+        if options.geometry == "homography":
+            verdict = judge_homography(pair, job.evidence, threshold_px, options)
+        else:
+            verdict = judge(pair, job.model, job.evidence, threshold_px, choice, options)
+        if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
+            verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
+        if job.focal is not None and verdict.status is Status.PLANAR:
+            verdict = replace(verdict, E=None, R=None, t=None)  # a plane tells no focal length
+        if not job.given and job.focal is None and options.geometry == "auto" and verdict.t is not None:
+            verdict = replace(verdict, E=None, R=None, t=None)  # nor do matches that no focal length explains
+        verdict = judge_mirror(pair, job.evidence, verdict, threshold_px, options)
+        found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
+        if options.keep_precision is not None and found:
+            verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
+        return verdict
+
+    def _remarks(self, verdict: Verdict, scores: NDArray[np.float32]) -> list[str]:
+        """Sentences on what may surprise about the answer."""
+        remarks = []
+        if verdict.info.get("mirrored"):
+            remarks.append("one of the images is mirrored: the matches agree with a view that no camera has")
+        asked = self.options.keep_precision
+        if (
+            asked is not None
+            and not verdict.mask.any()
+            and any(m is not None for m in (verdict.F, verdict.R, verdict.H))
+        ):
+            best = float(scores.max(initial=0.0))
+            remarks.append(
+                f"keep_precision={asked:g} keeps no match, for the best score is {best:.2f}: the status speaks of the "
+                "geometry alone; a threshold keeps what agrees with it"
+            )
+            _log.warning("%s", remarks[-1])
+        return remarks
 
     def _score(self, job: _Job) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Logits and scores (M,), (M,) of the network."""
@@ -276,16 +307,16 @@ class MatchFilter:
         assert job.model is not None
         assert job.evidence is not None
         assert job.sent is not None
-        estimate = estimate_focal(job.evidence, job.model.M)
-        if estimate is None:
-            return
-        pair, zoom = job.pair.with_focal(estimate.factor), np.diag([estimate.factor, estimate.factor, 1.0])
-        E = None if job.network_essential is None else project_to_essential(zoom @ job.network_essential @ zoom)
-        evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
-        search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
-        model = search.with_network(evidence)
-        if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
-            job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
+        for estimate in estimate_focals(job.evidence, job.model.M):
+            pair = job.pair.with_focals(*estimate.factors)
+            zoom1, zoom2 = (np.diag([factor, factor, 1.0]) for factor in estimate.factors)
+            E = None if job.network_essential is None else project_to_essential(zoom2 @ job.network_essential @ zoom1)
+            evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
+            search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
+            model = search.with_network(evidence)
+            if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
+                job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
+                return
 
     def _score_by_residuals(
         self, pair: PairInput, model: TwoViewModel
@@ -303,20 +334,23 @@ class MatchFilter:
         kept[pair.valid] = largest_set_of_precision(scores[pair.valid], self.options.keep_precision)
         return kept
 
-    def _describe_cameras(self, job: _Job) -> dict[str, Any]:
-        """Where the intrinsics come from, and what was assumed."""
-        assumptions = list(job.pair.assumptions)
+    def _assumptions(self, job: _Job) -> list[str]:
+        """Sentences on what was assumed of the cameras."""
         if job.focal is None:
-            return {"intrinsics": "given" if job.given else "guessed", "assumptions": assumptions}
-        focal_px = job.pair.focal_px / job.pair.unit_px
-        accuracy = f"to {100 * job.focal.sigma:.0f} %"
-        assumptions.append(f"focal length {focal_px:.0f} px of both images estimated from the matches, {accuracy}")
-        return {
-            "intrinsics": "estimated",
-            "assumptions": assumptions,
-            "focal_px": focal_px,
-            "focal_sigma": job.focal.sigma,
-        }
+            return list(job.pair.assumptions)
+        focals = [
+            f"focal length {focal:.0f} px of {{}} estimated from the matches, to {100 * sigma:.0f} %"
+            for focal, sigma in zip(job.focal_px, job.focal.sigmas)
+        ]
+        if job.focal_px[0] == job.focal_px[1]:
+            return [*job.pair.assumptions, focals[0].format("both images")]
+        return [*job.pair.assumptions, *(text.format(f"image {i}") for i, text in enumerate(focals, 1))]
+
+    def _describe_cameras(self, job: _Job) -> dict[str, Any]:
+        """Where the intrinsics come from."""
+        if job.focal is None:
+            return {"intrinsics": "given" if job.given else "guessed"}
+        return {"intrinsics": "estimated", "focal_px": job.focal_px, "focal_sigma": job.focal.sigmas}
 
     def _describe(self, job: _Job) -> dict[str, Any]:
         job.timings_ms["total"] = sum(job.timings_ms.values())
@@ -348,6 +382,15 @@ class _Job:
     sent: NetworkInput | None = None
     output: NetworkOutput | None = None
     focal: FocalEstimate | None = None
+
+    @property
+    def focal_px(self) -> tuple[float, float]:
+        """Focal lengths of both images in the caller's unit."""
+        camera1, camera2 = self.pair.intrinsics1.K, self.pair.intrinsics2.K
+        return (
+            mean_focal_length(camera1, camera1) / self.pair.unit_px,
+            mean_focal_length(camera2, camera2) / self.pair.unit_px,
+        )
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:
@@ -391,8 +434,9 @@ def filter_matches(
         matches: ``cv2.DMatch`` objects; ``knnMatch`` output, whose second candidates give the ratio; an integer
             array (M, 2); or None = row i matches row i. What matches and keypoints know beyond position (ratio,
             best of the list, size, angle) is used and never required.
-        K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal length is
-            guessed and F is the model to trust.
+        K1, K2: (3, 3) intrinsics; ``K1`` alone means that both images share it. Without, the focal lengths are
+            estimated from the matches, one or, where they ask for it, two (``info["focal_px"]``, with
+            ``info["focal_sigma"]``); where that fails F comes without E, R and t.
         dist1, dist2: OpenCV distortion coefficients: an array of 4, 5, 8, 12 or 14 is of the pinhole model,
             ``Fisheye(k1, k2, k3, k4)`` of ``cv2.fisheye``. E and F then hold for undistorted points, the threshold for
             the pixels that came in.
@@ -400,7 +444,7 @@ def filter_matches(
         threshold: inlier threshold of the mask, pixels (Sampson distance); the fit has its own.
         keep_precision: instead of a threshold: the mask holds the most matches whose expected precision, the mean of
             their scores, is at least this (above 0, below 1), whatever their distance to the model. All False where
-            there is no model, as ever.
+            there is no model, as ever, and where no score is so high, which ``info["assumptions"]`` then says.
         confidence: of the robust fit, between 0 and 1.
         method: robust fit: ``"auto"``, several unlike estimators and the most likely of what they find;
             ``"poselib"``, PoseLib's (needs that package) among them; ``"prosac"``, ``"magsac"``, ``"ransac"`` (or

@@ -60,16 +60,19 @@ class FilterResult:
         points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
         info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
-            ``intrinsics`` ("given", "estimated" with ``focal_px`` and ``focal_sigma``, its relative
-            standard deviation, or "guessed"), ``assumptions`` (list of sentences), ``num_network_matches`` and
+            ``intrinsics`` ("given", "guessed", or "estimated" with ``focal_px``, the focal lengths of both images,
+            equal unless the matches ask for two, and ``focal_sigma``, their relative standard deviations),
+            ``assumptions`` (list of sentences), ``num_network_matches`` and
             ``network_rows`` (those that entered the network), ``num_accepted`` (those above the decision threshold),
             ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
             robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",
             "network", "accepted", "score order", …, "plane"), and where the search ``ended`` ("before the network",
             where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:
             ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``translation_sigma_deg``
-            (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``focal_factor``
-            where the matches ask for focal lengths that many times those given (rough, a power of 1.2).
+            (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``mirrored``
+            (True where one of the images was flipped: there is no pose, and H mirrors where the pair is planar),
+            ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of
+            1.2).
     """
 
     mask: NDArray[np.bool_]
@@ -151,6 +154,7 @@ class FilterResult:
             guessed=self.info.get("intrinsics") == "guessed",
             confidence=self.confidence,
             focal_factor=self.info.get("focal_factor"),
+            mirrored=bool(self.info.get("mirrored")),
         )
         rows = {"status": self.status.value, "kept": f"{self.num_inliers} of {len(self.mask)} matches"}
         if self.R is not None:

@@ -62,6 +62,10 @@ _PLANE_WITHOUT_K = (
     "Use the kept matches and the homography in info. Without intrinsics a plane tells no pose: give K1 and K2 (on the "
     "command line --K fx,fy,cx,cy)."
 )
+_MIRRORED = (
+    "One of the images is mirrored: no camera sees an opaque surface from both sides, so that there is no pose. Flip "
+    "one image and match again; the kept matches, and the homography where there is one, are right as they are."
+)
 _UNSURE = 0.5
 
 
@@ -74,7 +78,12 @@ class VerdictText(NamedTuple):
 
 
 def describe_verdict(
-    status: str, *, guessed: bool = False, confidence: float | None = None, focal_factor: float | None = None
+    status: str,
+    *,
+    guessed: bool = False,
+    confidence: float | None = None,
+    focal_factor: float | None = None,
+    mirrored: bool = False,
 ) -> VerdictText:
     """What a status means and what to do next.
 
@@ -83,6 +92,7 @@ def describe_verdict(
         guessed: the intrinsics were a guess.
         confidence: probability that the pose is within 10 degrees, or None.
         focal_factor: the matches ask for focal lengths that many times those given, or None.
+        mirrored: one of the images is mirrored.
     """
     word = str(status)
     if word not in _TEXTS:
@@ -90,6 +100,8 @@ def describe_verdict(
     tone, headline, advice = _TEXTS[word]
     if guessed and word == "ok":
         advice = _GUESSED
+    if mirrored:
+        return VerdictText(tone, headline, _MIRRORED)
     if guessed and word == "planar":
         advice = _PLANE_WITHOUT_K
     if focal_factor is not None and math.isfinite(focal_factor):

@@ -35,7 +35,8 @@ def test_three_positional_arguments_are_enough(scene: Scene, model_file: Path) -
     result = filter_matches(*scene.keypoints(), scene.knn_matches(), model=model_file)
     assert result.status is Status.OK
     assert result.info["intrinsics"] == "estimated"
-    assert 0.25 * K[0, 0] < result.info["focal_px"] < 4.0 * K[0, 0]
+    focal1, focal2 = result.info["focal_px"]
+    assert 0.25 * K[0, 0] < focal1 == focal2 < 4.0 * K[0, 0]
     assert len(result.info["assumptions"]) == 3
     assert np.mean(result.mask == scene.inlier) > 0.95
 
@@ -239,6 +240,18 @@ def test_keep_precision_keeps_nothing_without_a_model(model_file: Path) -> None:
     kept = filter_matches(bad, make_scene().points2, None, K1=K, keep_precision=0.01, model=model_file).mask
     assert kept[50:].all()
     assert not kept[:50].any()
+
+
+def test_keep_precision_that_keeps_nothing_is_told(
+    scene: Scene, model_file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    none, some = (run(scene, model_file, keep_precision=p, effort="full") for p in (0.9999, 0.7))
+    assert not none.mask.any()
+    assert none.E is not None
+    told = f"keep_precision=0.9999 keeps no match, for the best score is {none.scores.max():.2f}"
+    assert none.info["assumptions"][-1].startswith(told)
+    assert caplog.messages == [none.info["assumptions"][-1]]
+    assert not any("keep_precision" in text for text in some.info["assumptions"])
 
 
 def test_second_intrinsics_default_to_the_first(scene: Scene, model_file: Path) -> None:

@@ -35,7 +35,7 @@ MAX_ACCIDENTAL_SHARE = 0.3
 INTRINSICS_SUPPORT_FACTOR = 1.5
 # Keypoints are not better than this, and the median of absolute normal deviates times this is their sigma.
 LEAST_NOISE_PX = 0.1
-_TO_SIGMA = 1.4826
+TO_SIGMA = 1.4826
 # A match this many sigmas off counts no more than that.
 _GRIC_CUT = 5.0
 _PRICE_OF_DIMENSION = 2.2
@@ -139,7 +139,7 @@ def prefers_rotation(rotation_px: Array, epipolar_px: Array) -> bool:
     turned = rotation_px < 2.0 * EXPLAINED_THRESHOLD_FACTOR
     rotation_px, epipolar_px = rotation_px[turned], epipolar_px[turned]
     count = len(epipolar_px)
-    noise = max(_TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
+    noise = max(TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
     # Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
     costs = [float(np.minimum((d / noise) ** 2, _GRIC_CUT**2).sum()) for d in (rotation_px, epipolar_px)]
     # Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.

@@ -1,8 +1,9 @@
-"""A focal length that both images share, from their matches alone: the one under which a pose agrees best.
+"""Focal lengths of both images from their matches alone: those under which a pose agrees best.
 
-A fundamental matrix of two views with otherwise known intrinsics determines it, unless the viewing axes are parallel
-or meet (Hartley & Zisserman, 2nd ed., sec. 19.3; Sturm 2001). Poses are refined under focal lengths on a grid, and what
-they leave of the matches, with a little belief in usual lenses, tells which is right and how surely.
+A fundamental matrix of two views with otherwise known intrinsics determines one that both share, unless the viewing
+axes are parallel or meet (Hartley & Zisserman, 2nd ed., sec. 19.3; Sturm 2001). Poses are refined under focal lengths
+on a grid, and what they leave of the matches, with a little belief in usual lenses, tells which is right and how
+surely. Where one focal length leaves more than two would, the images are of two cameras (``focal_pair.py``).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from ..geometry.epipolar import project_to_essential, sampson_distance
 from ..geometry.pose_refinement import refine_pose, truncated_cost
 from .evidence import Evidence
+from .focal_pair import FocalBelief, FocalPairFit
 from .robust_fit import REFINE_PX, TwoViewModel, pose_from_essential
 
 Array = NDArray[np.float64]
@@ -31,56 +33,84 @@ _REACH_PX = 16.0
 _ROUNDS = 6
 _MAX_ROWS = 300
 _MIN_ROWS = 12
+# Keypoints are not better than this.
+_LEAST_NOISE_PX = 0.1
 # With this share of the matches that agree with F an essential matrix takes its place.
 _LEAST_AGREEMENT = 0.8
 
 
 @dataclass(frozen=True)
 class FocalEstimate:
-    """A focal length.
+    """Focal lengths of both images.
 
     Attributes:
-        factor: on the guessed one.
-        sigma: standard deviation of its logarithm: 0.1 is ten per cent.
+        factors: on the guessed ones, of image 1 and 2; equal where both images share the factor.
+        sigmas: standard deviations of their logarithms: 0.1 is ten per cent.
     """
 
-    factor: float
-    sigma: float
+    factors: tuple[float, float]
+    sigmas: tuple[float, float]
+
+    @property
+    def shared(self) -> bool:
+        """Both images have the same factor."""
+        return self.factors[0] == self.factors[1]
 
 
-def estimate_focal(evidence: Evidence, F: Array) -> FocalEstimate | None:
-    """The focal length under which the matches agree best with a pose.
+def estimate_focals(evidence: Evidence, F: Array) -> list[FocalEstimate]:
+    """The focal lengths under which the matches agree best with a pose.
 
     Args:
-        evidence: scored matches, on the image planes normalised by the guessed focal length.
+        evidence: scored matches, on the image planes normalised by the guessed focal lengths.
         F: (3, 3) in the same coordinates.
 
     Returns:
-        The estimate; None where the matches are few. Where they say little, the guess has the greater weight, and the
+        Estimates, the most plausible first: two different factors where the matches ask for them, then one that both
+        images share. None where the matches are few. Where they say little, the guess has the greater weight, and the
         standard deviation tells.
     """
     focal_px = evidence.focal_px
     agreeing = evidence.correspondences[evidence.above(0.0)]
-    agreeing = agreeing[sampson_distance(agreeing, F) < REFINE_PX / focal_px]
-    rows = agreeing[:: max(1, -(-len(agreeing) // _MAX_ROWS))]
+    distance_px = sampson_distance(agreeing, F) * focal_px
+    near = distance_px < REFINE_PX
+    step = max(1, -(-int(np.count_nonzero(near)) // _MAX_ROWS))
+    rows = agreeing[near][::step]
     if len(rows) < _MIN_ROWS:
-        return None
-    costs = np.array([_cost_px(rows, F, factor, focal_px) for factor in _FACTORS])
+        return []
+    trials = [_pose_under(rows, F, factor, focal_px) for factor in _FACTORS]
+    costs = np.array([trial.cost_px for trial in trials])
+    shared, best = _shared_factor(costs, len(rows))
+    estimates = [] if shared is None else [shared]
+    trial = trials[best]
+    if trial.R is not None and trial.t is not None and np.isfinite(trial.cost_px):
+        noise_px = max(float(np.sqrt(np.mean(distance_px[near] ** 2))), _LEAST_NOISE_PX)
+        fit = FocalPairFit(rows, _THRESHOLD_PX / focal_px, noise_px / focal_px, FocalBelief(_USUAL, _USUAL_SPREAD))
+        two = fit.differing(trial.R, trial.t, float(np.log(_FACTORS[best])))
+        if two is not None:
+            factors, sigmas = np.exp(two.logs), np.hypot(two.sigmas, _LEAST_SIGMA)
+            differing = FocalEstimate((float(factors[0]), float(factors[1])), (float(sigmas[0]), float(sigmas[1])))
+            estimates.insert(0, differing)
+    return estimates
+
+
+def _shared_factor(costs: Array, count: int) -> tuple[FocalEstimate | None, int]:
+    """The factor that both images share, and the position of the nearest on the grid, from costs (19,) in px²."""
     if not np.isfinite(costs).any():
-        return None
+        return None, 0
     # The noise is what the best of them leaves.
-    noise = max(float(np.nanmin(costs)) / len(rows), 0.1**2)
+    noise = max(float(np.nanmin(costs)) / count, _LEAST_NOISE_PX**2)
     logs = np.log(_FACTORS)
     penalised = np.where(np.isfinite(costs), costs / noise, np.inf) + ((logs - _USUAL) / _USUAL_SPREAD) ** 2
     best = int(np.clip(np.argmin(penalised), 1, len(logs) - 2))
     if not np.isfinite(penalised[best - 1 : best + 2]).all():
-        return None
+        return None, best
     curve = np.polyfit(logs[best - 1 : best + 2], penalised[best - 1 : best + 2], 2)
     if curve[0] <= 0:
-        return None
+        return None, best
     at = float(np.clip(-curve[1] / (2.0 * curve[0]), logs[best - 1], logs[best + 1]))
     # A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
-    return FocalEstimate(float(np.exp(at)), float(np.hypot(_SIGMA_FACTOR / np.sqrt(curve[0]), _LEAST_SIGMA)))
+    factor, sigma = float(np.exp(at)), float(np.hypot(_SIGMA_FACTOR / np.sqrt(curve[0]), _LEAST_SIGMA))
+    return FocalEstimate((factor, factor), (sigma, sigma)), best
 
 
 def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free_model: TwoViewModel) -> bool:
@@ -96,14 +126,23 @@ def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free
     return bool(counts[0] >= _LEAST_AGREEMENT * counts[1])
 
 
-def _cost_px(rows: Array, F: Array, factor: float, focal_px: float) -> float:
-    """Truncated squared Sampson errors in px², summed, of the best pose under ``factor`` times the guess."""
+@dataclass(frozen=True)
+class _Trial:
+    """The best pose under a factor, and the squared Sampson errors that it leaves, each cut off, summed, in px²."""
+
+    R: Array | None
+    t: Array | None
+    cost_px: float
+
+
+def _pose_under(rows: Array, F: Array, factor: float, focal_px: float) -> _Trial:
+    """The pose that suits ``factor`` times the guess, from F."""
     zoom = np.diag([factor, factor, 1.0])
     scaled, focal = rows / factor, focal_px * factor
     pose = pose_from_essential(project_to_essential(zoom @ F @ zoom), scaled, focal / _REACH_PX)
     if pose is None:
-        return float("inf")
+        return _Trial(None, None, float("inf"))
     threshold = _THRESHOLD_PX / focal
     R, t = refine_pose(scaled, *pose, _REACH_PX / focal, _ROUNDS)
     R, t = refine_pose(scaled, R, t, threshold, _ROUNDS)
-    return truncated_cost(scaled, R, t, threshold) * focal**2
+    return _Trial(R, t, truncated_cost(scaled, R, t, threshold) * focal**2)

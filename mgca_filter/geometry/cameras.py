@@ -20,6 +20,8 @@ _LARGEST_PX = 1e6
 _DISTORTION_LENGTHS = (4, 5, 8, 12, 14)
 # Points of a camera whose lens shows nothing at so many of them: the coefficients are those of another model.
 _NOWHERE_SHARE = 0.2
+# No rectilinear lens is wider than this from its axis into the corner of the image, save for a few.
+_WIDEST_PINHOLE_DEG, _FARTHEST_PERCENTILE = 55.0, 98.0
 # Half the width of the difference that stands for a derivative.
 _STRETCH_STEP_PX = 0.25
 # The five steps that OpenCV takes unasked leave errors of a pixel in the corners of a wide lens.
@@ -135,16 +137,28 @@ def resolve_intrinsics(
 
 
 def lens_doubt(camera: Intrinsics, points: NDArray[np.float64], image: int) -> str | None:
-    """One sentence where the lens of a camera shows nothing at many of the keypoints (N, 2) of its image, or None."""
+    """One sentence where the lens of a camera can hardly be meant so, or None: it shows nothing at many of the
+    keypoints (N, 2) of its image, or four coefficients, legal for OpenCV's pinhole and fisheye model alike, are read as
+    a pinhole's that sees further to the side than such lenses do."""
     finite = points[np.isfinite(points).all(axis=1)]
     if camera.distortion is None or len(finite) == 0:
         return None
-    share = float(np.isnan(camera.normalize(finite)).any(axis=1).mean())
-    if share <= _NOWHERE_SHARE:
-        return None
-    doubt = f"dist{image} shows nothing at {100.0 * share:.0f} % of the keypoints of image {image}"
     plain = not isinstance(camera.distortion, Fisheye) and len(camera.distortion) == 4
-    return doubt + ("; if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)" if plain else "")
+    advice = "if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)"
+    normalized = camera.normalize(finite)
+    nowhere = np.isnan(normalized).any(axis=1)
+    share = float(nowhere.mean())
+    if share > _NOWHERE_SHARE:
+        doubt = f"dist{image} shows nothing at {100.0 * share:.0f} % of the keypoints of image {image}"
+        return f"{doubt}; {advice}" if plain else doubt
+    farthest = float(np.percentile(np.linalg.norm(normalized[~nowhere], axis=1), _FARTHEST_PERCENTILE))
+    angle_deg = float(np.degrees(np.arctan(farthest)))
+    if plain and angle_deg > _WIDEST_PINHOLE_DEG:
+        return (
+            f"the four coefficients of dist{image} are read as a pinhole's, and keypoints of image {image} lie up to "
+            f"{angle_deg:.0f}° off its axis; {advice}"
+        )
+    return None
 
 
 def _undistort(

@@ -19,6 +19,8 @@ _MAX_DAMPING = 1.0
 _SMALLEST_CURVATURE = 1e-12
 _CONVERGED_DECREASE = 1e-4
 MIN_INLIERS = 6
+# Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
+_LINEAR_DEG, _RINGS, _SPOKES, _SPREAD_ROWS = 0.1, 28, 12, 200
 # Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 REACH = 12.0
 
@@ -90,7 +92,11 @@ def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> fl
 def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> float:
     """Standard deviation of the direction of translation along its worst direction, degrees; at most 90.
 
-    Arguments as of :func:`pose_uncertainty_deg`; what the rotation takes up of the same residuals is accounted for.
+    From the curvature of the cost where that says that it is small; else from the likelihoods of directions all around,
+    for over a few pixels of parallax the cost is no paraboloid. What the rotation takes up of the same residuals is
+    accounted for.
+
+    Arguments as of :func:`pose_uncertainty_deg`.
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
@@ -100,7 +106,44 @@ def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) 
     damping = _SMALLEST_CURVATURE * np.eye(3)
     marginal = direction - cross.T @ np.linalg.solve(rotation + damping, cross)
     curvature = float(np.linalg.eigvalsh(marginal)[0])
-    return float(min(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 90.0))
+    linear_deg = float(min(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 90.0))
+    return linear_deg if linear_deg < _LINEAR_DEG else _direction_spread_deg(inliers, R, t, noise, linear_deg)
+
+
+def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scale_deg: float) -> float:
+    """The same from the likelihoods of directions on rings around ``t``, from a fraction of ``scale_deg`` to 90."""
+    step = max(1, -(-len(inliers) // _SPREAD_ROWS))
+    rows = inliers[::step]
+    edges = np.concatenate([[0.0], np.geomspace(np.radians(min(0.2 * scale_deg, 1.0)), np.pi / 2, _RINGS)])
+    angle, width = 0.5 * (edges[1:] + edges[:-1]), np.diff(edges)
+    turn = np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)
+    across = np.stack([np.cos(turn), np.sin(turn)], axis=1)  # (S, 2)
+    ring, spoke = np.repeat(np.arange(_RINGS), _SPOKES), np.tile(np.arange(_SPOKES), _RINGS)
+    offsets = across[spoke] @ _tangent_basis(t)
+    directions = np.cos(angle[ring])[:, None] * t + np.sin(angle[ring])[:, None] * offsets  # (D, 3)
+    costs = step * (_costs_of_directions(rows, R, directions) - _costs_of_directions(rows, R, t[None]))
+    log_weights = -0.5 * costs / noise**2 + np.log(np.sin(angle[ring]) * width[ring])
+    weights = np.exp(log_weights - log_weights.max())
+    moved = angle[ring][:, None] * across[spoke]
+    moments = (weights[:, None] * moved).T @ moved / weights.sum()
+    return float(min(np.degrees(np.sqrt(np.linalg.eigvalsh(moments)[1])), 90.0))
+
+
+def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
+    """Summed squared Sampson distances (D,) of matches (N, 4) to poses with directions (D, 3), the rotation moved from
+    R as each likes best, to first order."""
+    x1, x2 = (np.column_stack([part, np.ones(len(rows))]) for part in (rows[:, :2], rows[:, 2:]))
+    rays = x1 @ R.T  # (N, 3), in the second camera
+    normals = np.cross(x2[None], directions[:, None])  # (D, N, 3)
+    lines2, lines1 = np.cross(directions[:, None], rays[None]), normals @ R
+    squared_norm = np.sum(lines2[..., :2] ** 2, axis=2) + np.sum(lines1[..., :2] ** 2, axis=2)
+    scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))  # (D, N)
+    residual = np.einsum("nk,dnk->dn", rays, normals) * scale
+    J = np.cross(rays[None], normals) * scale[..., None]  # (D, N, 3)
+    gradient = np.einsum("dnk,dn->dk", J, residual)
+    hessian = np.einsum("dnj,dnk->djk", J, J) + _SMALLEST_CURVATURE * np.eye(3)
+    gain = np.einsum("dk,dk->d", gradient, np.linalg.solve(hessian, gradient[..., None])[..., 0])
+    return np.asarray(np.sum(residual**2, axis=1) - gain, dtype=np.float64)
 
 
 class SampsonTerms:

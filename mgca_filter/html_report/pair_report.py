@@ -143,6 +143,7 @@ def write_pair_report(
         guessed=result.info.get("intrinsics") == "guessed",
         confidence=getattr(result, "confidence", None),
         focal_factor=result.info.get("focal_factor"),
+        mirrored=bool(result.info.get("mirrored")),
     )
     words = {
         "tone": verdict.tone,

@@ -104,17 +104,15 @@ class PairInput:
         """Mean focal length in pixels."""
         return mean_focal_length(self.intrinsics1.K, self.intrinsics2.K)
 
-    def with_focal(self, factor: float) -> PairInput:
-        """The pair under the guessed focal length times ``factor``, taken for the truth from now on."""
-        zoom = np.diag([factor, factor, 1.0])
+    def with_focals(self, factor1: float, factor2: float) -> PairInput:
+        """The pair under the guessed focal lengths times factors, one an image, taken for the truth from now on."""
         cameras = []
-        for camera in (self.intrinsics1, self.intrinsics2):
+        for camera, factor in ((self.intrinsics1, factor1), (self.intrinsics2, factor2)):
             K = camera.K.copy()
-            K[:2, :2] = K[:2, :2] @ zoom[:2, :2]
+            K[:2, :2] *= factor
             cameras.append(replace(camera, K=K, guessed=False))
-        return replace(
-            self, correspondences=self.correspondences / factor, intrinsics1=cameras[0], intrinsics2=cameras[1]
-        )
+        correspondences = self.correspondences / np.repeat([factor1, factor2], 2)
+        return replace(self, correspondences=correspondences, intrinsics1=cameras[0], intrinsics2=cameras[1])
 
     def epipolar_distance_px(
         self, rows: NDArray[np.intp] | NDArray[np.bool_], E: NDArray[np.float64]

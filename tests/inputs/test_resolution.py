@@ -87,6 +87,7 @@ def test_enlarged_photographs_keep_their_matches() -> None:
         )
         result = match_images(*large, K1=K_large, max_keypoints=2000).result
         counts[factor] = result.num_inliers
+        assert result.status is Status.OK
         assert pose_error_deg(result.R, result.t, np.array(truth["R"]), np.array(truth["t"])) < 1.0
     assert min(counts.values()) > 0.9 * counts[1]
     assert max(counts.values()) < 1.1 * counts[1]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from conftest import K as scene_K
+from conftest import make_scene
 from fisheye_views import LENS, RIGHT, K, P, Q, R, T, recalls
 
 from mgca_filter import MatchFilter, MatchPair, filter_matches
@@ -38,6 +40,15 @@ def test_four_plain_coefficients_are_those_of_a_pinhole() -> None:
     lens = [LENS.k1, LENS.k2, LENS.k3, LENS.k4]
     plain, fisheye = (filter_matches(P, Q, None, K1=K, dist1=d) for d in (lens, LENS))
     assert plain.num_inliers < 0.6 * fisheye.num_inliers
+    told = [[text for text in result.info["assumptions"] if "Fisheye(k1" in text] for result in (plain, fisheye)]
+    assert [len(texts) for texts in told] == [2, 0]
+    assert "read as a pinhole's" in told[0][0]
+
+
+def test_an_ordinary_lens_is_not_doubted() -> None:
+    scene = make_scene()
+    result = filter_matches(scene.points1, scene.points2, None, K1=scene_K, dist1=[-0.2, 0.05, 0.001, 0.0])
+    assert not any("Fisheye" in text for text in result.info["assumptions"])
 
 
 def test_a_lens_that_shows_nothing_at_the_keypoints_is_told() -> None:

@@ -1,0 +1,176 @@
+"""Photographs without K: how good is the pose, and how sure are the focal lengths?
+
+``python -m benchmarks.without_intrinsics [BUNDLES]``, on pairs of scene bundles: the pose that comes without K; what
+F, which comes with it, would have given with the true K; and the pose under a focal length that is guessed. ``--zooms``
+enlarges image 2 about its principal point, as if another lens had taken it. Without bundles the pairs are made up.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mgca_filter.data.scene_bundle import ScenePair
+from mgca_filter.evaluation.metrics import FAILURE_DEG, mean_average_precision
+from mgca_filter.evaluation.pairs import iterate_pairs
+from mgca_filter.fit.robust_fit import pose_from_essential
+from mgca_filter.geometry.cameras import mean_focal_length
+from mgca_filter.geometry.epipolar import pose_error_deg, project_to_essential
+from mgca_filter.geometry.pose_refinement import rotation_from_vector
+from mgca_filter.inputs.attributes import MatchAttributes
+from mgca_filter.match_filter import MatchFilter
+from mgca_filter.result import FilterResult, Status
+from mgca_filter.tables import markdown_head, markdown_row
+
+from .study import drawn_pairs, match_pair, result_error_deg, run_study, study_parser
+
+Array = NDArray[np.float64]
+
+SIZE = (1000, 750)
+RIGHT, WRONG, NOISE_PX = 300, 100, 0.5
+RIGHT_DEG = 10.0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One pair: pose errors in degrees, 180 without a pose, and the focal lengths.
+
+    Attributes:
+        pose, with_true_K, guessed: without K; by F and the true K; by the guessed focal length.
+        status, intrinsics: words of the result.
+        errors: (2,) logarithms of the estimated focal lengths over the true ones, None where none are estimated.
+        sigmas: (2,) what the filter says of them. two: they differ.
+    """
+
+    pose: float
+    with_true_K: float
+    guessed: float
+    status: str
+    intrinsics: str
+    errors: Array | None
+    sigmas: Array | None
+    two: bool
+
+
+def zoomed(pair: ScenePair, zoom: float) -> ScenePair:
+    """The pair with its second image taken at ``zoom`` times the focal length; what leaves the image is left out."""
+    if zoom == 1.0:
+        return pair
+    centre = pair.K2[:2, 2]
+    points2 = (pair.points2 - centre) * zoom + centre
+    inside = np.flatnonzero(((points2 >= 0) & (points2 < np.array(pair.image_size2))).all(axis=1))
+    K2 = pair.K2.copy()
+    K2[:2, :2] *= zoom
+    return replace(pair, points2=points2, K2=K2).take(inside)
+
+
+def make_pair(seed: int, zoom: float) -> ScenePair:
+    """A made-up pair: cameras of usual focal lengths that look about the same way, past each other."""
+    rng = np.random.default_rng(seed)
+    focal1 = 1.2 * SIZE[0] * np.exp(np.clip(rng.normal(-0.3, 0.3), -0.8, 0.4))
+    centre = (np.array(SIZE) - 1) / 2
+    K1, K2 = (np.array([[f, 0, centre[0]], [0, f, centre[1]], [0, 0, 1.0]]) for f in (focal1, zoom * focal1))
+    while True:
+        R, t = rotation_from_vector(rng.normal(0, 0.2, 3)), rng.normal(0, 1.0, 3)
+        points1 = rng.uniform((0, 0), SIZE, (20 * RIGHT, 2))
+        X = np.column_stack([points1, np.ones(len(points1))]) @ np.linalg.inv(K1).T
+        X2 = (X * rng.uniform(3, 9, (len(X), 1))) @ R.T + t
+        with np.errstate(all="ignore"):
+            points2 = (X2 @ K2.T)[:, :2] / X2[:, 2:]
+        seen = np.flatnonzero((X2[:, 2] > 0.5) & ((points2 > 0) & (points2 < np.array(SIZE))).all(axis=1))[:RIGHT]
+        if len(seen) == RIGHT:
+            break
+    ends1, ends2 = (
+        np.vstack([p[seen] + rng.normal(0, NOISE_PX, (RIGHT, 2)), rng.uniform((0, 0), SIZE, (WRONG, 2))])
+        for p in (points1, points2)
+    )
+    right = np.arange(RIGHT + WRONG) < RIGHT
+    ratio = np.where(right, rng.uniform(0.3, 0.85, len(right)), rng.uniform(0.7, 1.0, len(right))).astype(np.float32)
+    attributes = MatchAttributes(ratio=ratio, best=np.ones(len(right), dtype=bool))
+    pose = R, t / np.linalg.norm(t)
+    return ScenePair("made up", seed, "1", "2", ends1, ends2, K1, K2, SIZE, SIZE, *pose, attributes, right)
+
+
+def run_pair(pair: ScenePair, match_filter: MatchFilter, without_estimate: MatchFilter) -> Outcome:
+    """Filter a pair without K."""
+    bare = replace(match_pair(pair), K1=None, K2=None)
+    result, guessed = match_filter.filter_many([bare])[0], without_estimate.filter_many([bare])[0]
+    errors = sigmas = None
+    two = False
+    if result.info["intrinsics"] == "estimated":
+        estimated = np.array(result.info["focal_px"])
+        errors = np.log(estimated / [mean_focal_length(K, K) for K in (pair.K1, pair.K2)])
+        sigmas = np.array(result.info["focal_sigma"])
+        sides = np.array([max(pair.image_size1), max(pair.image_size2)])
+        two = bool(abs(np.diff(np.log(estimated / sides))[0]) > 1e-6)
+    poses = result_error_deg(result, pair), _error_with_true_K(guessed, pair), result_error_deg(guessed, pair)
+    return Outcome(*poses, str(result.status), result.info["intrinsics"], errors, sigmas, two)
+
+
+def _error_with_true_K(result: FilterResult, pair: ScenePair) -> float:
+    """Pose error of F under the true intrinsics."""
+    if result.F is None or not result.mask.any():
+        return FAILURE_DEG
+    E = project_to_essential(pair.K2.T @ result.F @ pair.K1)
+    pose = pose_from_essential(E, pair.correspondences[result.mask], mean_focal_length(pair.K1, pair.K2))
+    return FAILURE_DEG if pose is None else pose_error_deg(*pose, pair.R, pair.t)
+
+
+HEADER = [
+    "zoom",
+    "pairs",
+    "R, t mAP@20",
+    "F with the true K",
+    "guessed focal length",
+    "ok",
+    f"of these within {RIGHT_DEG:g}°",
+] + [*("estimated", "two found", "focal error, %", "within 1 sigma, %", "within 2, %")]
+
+
+def cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
+    """A row: accuracies in per cent, the median error of the focal lengths, and how often it lies within sigmas."""
+    kinds = ([getattr(o, name) for o in outcomes] for name in ("pose", "with_true_K", "guessed"))
+    fine = [o for o in outcomes if o.status == Status.OK and o.pose < FAILURE_DEG]
+    row = [f"{zoom:g}", str(len(outcomes)), *(f"{100 * mean_average_precision(errors, 20):.1f}" for errors in kinds)]
+    row += [str(len(fine)), f"{100 * np.mean([o.pose < RIGHT_DEG for o in fine]):.1f}" if fine else ""]
+    known = [(o.errors, o.sigmas) for o in outcomes if o.errors is not None and o.sigmas is not None]
+    row += [str(len(known)), str(sum(o.two for o in outcomes))]
+    if not known:
+        return [*row, "", "", ""]
+    errors, sigmas = (np.concatenate(values) for values in zip(*known))
+    within = (f"{100 * np.mean(np.abs(errors) < factor * sigmas):.0f}" for factor in (1.0, 2.0))
+    return [*row, f"{100 * np.median(np.abs(errors)):.1f}", *within]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; 0 = done, 2 = a file or option that cannot be used."""
+    parser = study_parser("without_intrinsics", __doc__)
+    parser.add_argument("bundles", metavar="BUNDLES", type=Path, nargs="?", help="scene bundles; none = made-up pairs")
+    parser.add_argument("--zooms", type=float, nargs="+", default=[1.0, 0.6, 1.6], help="default 1 0.6 1.6")
+    parser.add_argument("--pairs", type=int, default=30, help="made-up pairs a row (default 30)")
+    return run_study(run, parser.parse_args(arguments))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Print a row for each zoom as it is measured, all on the same pairs."""
+    filters = MatchFilter(model=options.model), MatchFilter(model=options.model, geometry="fundamental")
+    if options.bundles is not None:
+        pairs = list(iterate_pairs(drawn_pairs(options)))
+    print(markdown_head(HEADER))
+    for zoom in options.zooms:
+        if options.bundles is None:
+            drawn = [make_pair(seed, zoom) for seed in range(options.seed, options.seed + options.pairs)]
+        else:
+            drawn = [zoomed(pair, zoom) for pair in pairs]
+        print(markdown_row(cells(zoom, [run_pair(pair, *filters) for pair in drawn])), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

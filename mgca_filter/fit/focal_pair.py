@@ -1,0 +1,164 @@
+"""Two focal lengths, one an image, where the matches say that they differ: a zoom, or photographs of two cameras.
+
+A fundamental matrix determines both, unless the viewing axes meet (Hartley & Zisserman, 2nd ed., sec. 19.3; Sturm,
+2001). Pose and focal lengths are refined together, with a little belief in usual lenses, from what a shared focal
+length gives; two are believed where they leave markedly less of the matches than one does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.epipolar import cross_matrix, sampson_distance
+from ..geometry.pose_refinement import rotation_from_vector
+
+Array = NDArray[np.float64]
+
+# Real matches are far from independent, and cameras no perfect pinholes: a squared error weighs this much less.
+TEMPER = 9.0
+# Two focal lengths are believed where they lower the tempered sum of squares, with what they cost in belief, by this.
+MIN_GAIN = 6.0
+# Nearer to each other than this they are those of one camera, whose lens bends lines a little.
+MIN_LOG_RATIO = 0.15
+# And so many standard deviations apart: on a plane, say, a zoom cannot be told from a move.
+MIN_RATIO_SIGMAS = 2.0
+# Zooms between the images that refinement starts from, beside that of the shared focal length.
+_ZOOMS = (0.4, 0.63, 1.6, 2.5)
+_ROUNDS = 25
+_MAX_DAMPING, _CONVERGED_DECREASE = 1e4, 1e-5
+_DIFFERENCE = 1e-6
+_LARGEST_STEP = 0.3
+_LARGEST_LOG = 2.3
+# What makes of the curvature standard deviations that two thirds of the training pairs keep.
+_SIGMA_FACTOR = 1.4
+
+
+@dataclass(frozen=True)
+class FocalBelief:
+    """Where cameras lie from the guessed focal length, in its logarithm: mean and standard deviation."""
+
+    mean: float
+    spread: float
+
+
+@dataclass(frozen=True)
+class TwoFocals:
+    """Pose and focal lengths of both images.
+
+    Attributes:
+        R, t: (3, 3) and (3,) unit norm.
+        logs: (2,) logarithms of the factors on the guessed focal lengths.
+        sigmas: (2,) their standard deviations.
+        ratio_sigma: standard deviation of the logarithm of their ratio, which is often known much better.
+        cost: tempered sum of squares, with the belief's share.
+    """
+
+    R: Array
+    t: Array
+    logs: Array
+    sigmas: Array
+    ratio_sigma: float
+    cost: float
+
+    @property
+    def log_ratio(self) -> float:
+        """Logarithm of the factor of image 2 over that of image 1."""
+        return float(self.logs[1] - self.logs[0])
+
+
+class FocalPairFit:
+    """Least squares on a pose and two focal lengths.
+
+    Args:
+        rows: (N, 4) matches on the image planes normalised by the guessed focal lengths.
+        threshold: Sampson distance where the error is cut off, in that unit.
+        noise: standard deviation of the distances, likewise.
+        belief: in usual lenses.
+    """
+
+    def __init__(self, rows: Array, threshold: float, noise: float, belief: FocalBelief) -> None:
+        self._rows, self._threshold, self._belief = rows, threshold, belief
+        self._scale = 1.0 / (TEMPER * noise**2)
+
+    def differing(self, R: Array, t: Array, log_factor: float) -> TwoFocals | None:
+        """The best with two focal lengths, or None where one does about as well.
+
+        Args:
+            R, t, log_factor: pose and logarithm of the factor on both guesses that suit the matches best.
+        """
+        shared = np.array([log_factor, log_factor])
+        before = self._cost(self._distances(R, t, shared), shared)
+        found = self._refined(R, t, shared)
+        if before - found.cost < MIN_GAIN:
+            return None
+        for zoom in _ZOOMS:
+            half = 0.5 * np.log(zoom)
+            other = self._refined(R, t, shared + np.array([-half, half]))
+            if other.cost < found.cost:
+                found = other
+        return found if abs(found.log_ratio) > max(MIN_LOG_RATIO, MIN_RATIO_SIGMAS * found.ratio_sigma) else None
+
+    def _refined(self, R: Array, t: Array, logs: Array) -> TwoFocals:
+        """Levenberg–Marquardt from a start."""
+        distance = self._distances(R, t, logs)
+        cost, damping = self._cost(distance, logs), 1e-3
+        for _ in range(_ROUNDS):
+            hessian, gradient = self._normal_equations(R, t, logs, distance)
+            previous = cost
+            while damping < _MAX_DAMPING:
+                damped = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
+                step: Array = -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
+                step = step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+                moved = _moved(R, t, logs, step)
+                new_distance = self._distances(*moved)
+                new_cost = self._cost(new_distance, moved[2])
+                if new_cost < cost:
+                    (R, t, logs), distance, cost = moved, new_distance, new_cost
+                    damping *= 0.1
+                    break
+                damping *= 10.0
+            if cost > previous - _CONVERGED_DECREASE * max(previous, 1.0):
+                break
+        hessian, _ = self._normal_equations(R, t, logs, distance)
+        covariance = np.linalg.inv(hessian + 1e-9 * np.eye(7))[5:, 5:]
+        directions = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]])
+        variances = np.einsum("ij,jk,ik->i", directions, covariance, directions)
+        sigmas = _SIGMA_FACTOR * np.sqrt(np.maximum(variances, 0.0))
+        return TwoFocals(R, t, logs, sigmas[:2], float(sigmas[2]), cost)
+
+    def _distances(self, R: Array, t: Array, logs: Array) -> Array:
+        """Sampson distances (N,) in the unit of the guessed focal lengths, whatever the factors."""
+        shrink1, shrink2 = (np.diag([np.exp(-log), np.exp(-log), 1.0]) for log in logs)
+        return sampson_distance(self._rows, shrink2 @ cross_matrix(t) @ R @ shrink1)
+
+    def _cost(self, distance: Array, logs: Array) -> float:
+        if np.abs(logs).max() > _LARGEST_LOG or not np.isfinite(distance).all():
+            return float("inf")
+        errors = float(np.minimum(distance, self._threshold) @ np.minimum(distance, self._threshold))
+        belief = float(np.sum(((logs - self._belief.mean) / self._belief.spread) ** 2))
+        return self._scale * errors + belief
+
+    def _normal_equations(self, R: Array, t: Array, logs: Array, distance: Array) -> tuple[Array, Array]:
+        """Hessian (7, 7) and gradient (7,) over turns, moves of t and logarithms; distances have no sign, but neither
+        has the product of one with its derivative."""
+        near = distance < self._threshold
+        columns = [
+            (self._distances(*_moved(R, t, logs, _DIFFERENCE * unit))[near] - distance[near]) / _DIFFERENCE
+            for unit in np.eye(7)
+        ]
+        jacobian = np.stack(columns, axis=1)
+        hessian = self._scale * (jacobian.T @ jacobian)
+        gradient = self._scale * (jacobian.T @ distance[near])
+        hessian[[5, 6], [5, 6]] += 1.0 / self._belief.spread**2
+        gradient[5:] += (logs - self._belief.mean) / self._belief.spread**2
+        return hessian, gradient
+
+
+def _moved(R: Array, t: Array, logs: Array, step: Array) -> tuple[Array, Array, Array]:
+    """Pose and logarithms after a step (7,)."""
+    across = np.linalg.svd(t[None])[2][1:]
+    moved = t + step[3:5] @ across
+    return rotation_from_vector(step[:3]) @ R, moved / np.linalg.norm(moved), logs + step[5:]

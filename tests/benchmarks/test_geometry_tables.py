@@ -1,0 +1,66 @@
+"""Tables of small motion, fisheyes and photographs without K: their pairs are what they say, their rows add up."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks import fisheye, small_motion, without_intrinsics
+from mgca_filter import MatchFilter
+from mgca_filter.geometry.epipolar import essential_from_pose, sampson_distance
+
+
+def normalized(points: np.ndarray, K: np.ndarray) -> np.ndarray:
+    return (points - K[:2, 2]) / np.array([K[0, 0], K[1, 1]])
+
+
+@pytest.mark.parametrize("parallax_px", [0.5, 8.0])
+def test_tracks_have_the_parallax_that_they_are_made_for(parallax_px: float) -> None:
+    tracks = small_motion.make_tracks(parallax_px, 1e-9, 0)
+    still = small_motion._project(
+        (np.column_stack([normalized(tracks.points1, small_motion.K), np.ones(400)])) @ tracks.R.T
+    )
+    moved = np.linalg.norm(tracks.points2 - still, axis=1)[tracks.right]
+    assert np.median(moved) == pytest.approx(parallax_px, rel=0.2)
+    assert not small_motion.make_tracks(0.0, 0.1, 0).t.any()
+
+
+def test_a_row_of_small_motion(match_filter: MatchFilter) -> None:
+    outcomes = [small_motion.run_pair(small_motion.make_tracks(8.0, 0.1, seed), match_filter) for seed in range(2)]
+    row = small_motion.cells(8.0, 0.1, outcomes)
+    assert len(row) == len(small_motion.HEADER)
+    assert float(row[3]) > 95.0
+    assert float(row[7]) < 2.0
+    still = [small_motion.run_pair(small_motion.make_tracks(0.0, 0.1, 0), match_filter)]
+    assert small_motion.cells(0.0, 0.1, still)[2] == "1 pure_rotation"
+    assert small_motion.cells(0.0, 0.1, still)[-1] == ""
+
+
+def test_rings_of_a_fisheye(match_filter: MatchFilter) -> None:
+    views = fisheye.make_views(0)
+    rings = fisheye.recalls(views, views.right)
+    assert rings == [1.0] * len(fisheye.RINGS_DEG)
+    lens, flat = (fisheye.run_pair(views, row, match_filter) for row in fisheye.ROWS[:2])
+    assert fisheye.recalls(views, lens.mask)[-1] > 0.95 > 0.6 > fisheye.recalls(views, flat.mask)[-1]
+
+
+@pytest.mark.parametrize("zoom", [1.0, 1.6])
+def test_made_up_pairs_obey_their_cameras(zoom: float) -> None:
+    pair = without_intrinsics.make_pair(0, zoom)
+    right = np.arange(len(pair.points1)) < without_intrinsics.RIGHT
+    rows = np.hstack([normalized(pair.points1, pair.K1), normalized(pair.points2, pair.K2)])[right]
+    assert np.median(sampson_distance(rows, essential_from_pose(pair.R, pair.t))) * pair.K1[0, 0] < 1.0
+    larger = without_intrinsics.zoomed(pair, 2.0)
+    assert larger.K2[0, 0] == 2.0 * pair.K2[0, 0]
+    assert 0 < len(larger.points2) < len(pair.points2)
+
+
+def test_a_row_without_intrinsics(match_filter: MatchFilter) -> None:
+    pair = without_intrinsics.make_pair(3, 1.6)
+    free = MatchFilter.over(
+        match_filter._backend, without_intrinsics.replace(match_filter.options, geometry="fundamental")
+    )
+    row = without_intrinsics.cells(1.6, [without_intrinsics.run_pair(pair, match_filter, free)])
+    assert len(row) == len(without_intrinsics.HEADER)
+    assert float(row[2]) == 100.0
+    assert row[7:9] == ["1", "1"]
