@@ -137,7 +137,7 @@ def test_tool_answers_in_words_and_json(build):
     ("words", "message"),
     [
         ([], "expected two images"),
-        (["a.png", "b.png"], "expected --model"),
+        (["a.png", "b.png"], "a.png: not a readable image"),  # by the model within the library
         (["a.png", "b.png", "--model", "m.onnx", "--K", "1,2,3"], "--K: expected fx,fy,cx,cy"),
         (["a.png", "b.png", "--model", "m.onnx", "--no", "1"], "--no: unknown"),
         (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "--method: unknown"),

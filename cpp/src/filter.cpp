@@ -1,5 +1,6 @@
 // The public door; the flow of one pair, one call per step, in order; mgca_filter/match_filter.py.
 
+#include "embedded_model.hpp"
 #include "focal_estimate.hpp"
 #include "model_file.hpp"
 #include "network.hpp"
@@ -11,6 +12,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <string_view>
 #include <utility>
 
 namespace mgca {
@@ -49,7 +51,7 @@ void check(const RuntimeOptions& options) {
     }
 }
 
-std::shared_ptr<const Model::State> open_model(const std::string& content, const std::string& source,
+std::shared_ptr<const Model::State> open_model(std::string_view content, const std::string& source,
                                                const std::filesystem::path& file, const RuntimeOptions& options) {
     check(options);
     auto state = std::make_shared<Model::State>();
@@ -94,7 +96,16 @@ Model Model::from_memory(const void* data, std::size_t size, const RuntimeOption
     if (data == nullptr) {
         throw ArgumentError("data: expected the bytes of a model file");
     }
-    return Model(open_model(std::string(static_cast<const char*>(data), size), "model in memory", {}, options));
+    return Model(open_model({static_cast<const char*>(data), size}, "model in memory", {}, options));
+}
+
+bool has_embedded_model() noexcept { return !detail::embedded_model().empty(); }
+
+Model embedded_model(const RuntimeOptions& options) {
+    if (!has_embedded_model()) {
+        throw ModelError("this library was built without a model in it (MGCA_EMBED_MODEL=ON); use Model::from_file");
+    }
+    return Model(open_model(detail::embedded_model(), "embedded model", {}, options));
 }
 
 const std::string& Model::name() const noexcept { return state_->metadata.name; }

@@ -9,6 +9,7 @@
 
 #include <memory>
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace mgca::detail {
@@ -34,7 +35,7 @@ public:
 /// Open a model from its bytes; throws ModelError or RuntimeError.
 ///
 /// @param source what messages call it. file: where the bytes were read, or empty.
-std::unique_ptr<Network> open_network(const std::string& content, const std::string& source,
+std::unique_ptr<Network> open_network(std::string_view content, const std::string& source,
                                       const std::filesystem::path& file, const RuntimeOptions& options);
 
 /// Name and version of the runtime.

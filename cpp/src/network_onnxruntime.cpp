@@ -60,7 +60,7 @@ void append_provider(Ort::SessionOptions& session, const std::string& name, cons
 
 class OnnxNetwork : public Network {
 public:
-    OnnxNetwork(const std::string& content, const std::string& source, const RuntimeOptions& options)
+    OnnxNetwork(std::string_view content, const std::string& source, const RuntimeOptions& options)
         : environment_(make_environment()), session_(nullptr) {
         Ort::SessionOptions session;
         for (const std::string& name : options.providers) {
@@ -116,7 +116,7 @@ private:
 
 }  // namespace
 
-std::unique_ptr<Network> open_network(const std::string& content, const std::string& source,
+std::unique_ptr<Network> open_network(std::string_view content, const std::string& source,
                                       const std::filesystem::path& /*file*/, const RuntimeOptions& options) {
     return std::make_unique<OnnxNetwork>(content, source, options);
 }

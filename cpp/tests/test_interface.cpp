@@ -248,6 +248,19 @@ void memory_and_file_agree(const std::filesystem::path& file, const Model& model
     check::that(same(from_memory(pair), Filter(model)(pair)), "a model in memory, on two threads, answers the same");
 }
 
+void embedded_model_is_the_file(const Model& model, const MatchPair& pair) {
+    check::equal(mgca::has_embedded_model(), MGCA_TEST_EMBEDDED != 0, "whether a model is embedded");
+    if (mgca::has_embedded_model()) {
+        check::that(same(Filter(mgca::embedded_model())(pair), Filter(model)(pair)), "the embedded model is the same");
+        check::equal(mgca::embedded_model().version(), model.version(), "version of the embedded model");
+        mgca::RuntimeOptions runtime;
+        runtime.threads = -1;
+        check::throws<ArgumentError>([&] { mgca::embedded_model(runtime); }, "threads");
+    } else {
+        check::throws<ModelError>([] { mgca::embedded_model(); }, "MGCA_EMBED_MODEL");
+    }
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -267,5 +280,6 @@ int main(int argc, char** argv) {
     cameras_are_felt(model, pair);
     threads_share_a_filter(model, pair);
     memory_and_file_agree(file, model, pair);
+    embedded_model_is_the_file(model, pair);
     return check::result("interface");
 }

@@ -29,8 +29,8 @@ namespace {
 constexpr int kFound = 0, kNothingFound = 1, kError = 2;
 
 constexpr const char* kHelp =
-    "usage: mgca_match IMAGE1 IMAGE2 --model FILE [options]\n"
-    "  --model FILE            ONNX file of mgca_filter\n"
+    "usage: mgca_match IMAGE1 IMAGE2 [--model FILE] [options]\n"
+    "  --model FILE            ONNX file of mgca_filter (default: the model within the library, where it has one)\n"
     "  --K, --K2 fx,fy,cx,cy   intrinsics in pixels; without --K2 both images share them, without both they are guessed\n"
     "  --dist, --dist2 k1,k2,p1,p2[,...]  distortion coefficients of OpenCV\n"
     "  --threshold PX          inlier threshold of the mask (default 1)\n"
@@ -168,8 +168,8 @@ Arguments parse_arguments(const std::vector<std::string>& words) {
     if (arguments.images.size() != 2) {
         throw std::invalid_argument("expected two images");
     }
-    if (arguments.model.empty()) {
-        throw std::invalid_argument("expected --model");
+    if (arguments.model.empty() && !mgca::has_embedded_model()) {
+        throw std::invalid_argument("expected --model: the library was built without a model in it");
     }
     return arguments;
 }
@@ -270,7 +270,9 @@ void print_words(std::ostream& out, const mgca::Result& result, double milliseco
 }
 
 int run(Arguments arguments) {
-    const mgca::Filter filter(mgca::Model::from_file(arguments.model, arguments.runtime), arguments.options);
+    const mgca::Model model = arguments.model.empty() ? mgca::embedded_model(arguments.runtime)
+                                                      : mgca::Model::from_file(arguments.model, arguments.runtime);
+    const mgca::Filter filter(model, arguments.options);
     std::vector<cv::KeyPoint> keypoints1, keypoints2;
     const cv::Mat descriptors1 =
         detect(arguments.images[0], arguments.max_keypoints, keypoints1, arguments.camera1.size);

@@ -1,6 +1,6 @@
 // Tells right feature matches from wrong ones and estimates the two-view geometry.
 //
-//     const mgca::Filter filter(mgca::Model::from_file("mgca_small.onnx"));
+//     const mgca::Filter filter(mgca::embedded_model());  // or mgca::Model::from_file("mgca_small.onnx")
 //     const mgca::Result result = filter(keypoints1, keypoints2, knn_matches, K);
 //     if (result.ok()) use(*result.R, *result.t);
 //
@@ -129,9 +129,16 @@ public:
 
 private:
     friend class Filter;
+    friend MGCA_API Model embedded_model(const RuntimeOptions& options);
     explicit Model(std::shared_ptr<const State> state) : state_(std::move(state)) {}
     std::shared_ptr<const State> state_;
 };
+
+/// The library was built with a model in it (MGCA_EMBED_MODEL).
+MGCA_API bool has_embedded_model() noexcept;
+
+/// Open the model that is within the library; throws ModelError where it was built without one, or RuntimeError.
+MGCA_API Model embedded_model(const RuntimeOptions& options = {});
 
 /// Keypoints of one image; converts from what OpenCV programs hold.
 struct MGCA_API Keypoints {
