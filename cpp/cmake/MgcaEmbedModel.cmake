@@ -38,6 +38,8 @@ if(NOT MGCA_HAS_INCBIN)
     "MGCA_EMBED_MODEL: ${CMAKE_CXX_COMPILER} cannot put a file into a program (no .incbin; g++ and clang can). "
     "Use -DMGCA_EMBED_MODEL=OFF, and mgca::Model::from_file or from_memory.")
 endif()
+# Without link-time optimisation, which would read the file when a user's program is linked.
 set_source_files_properties(src/embedded_model.cpp PROPERTIES
   COMPILE_DEFINITIONS "MGCA_EMBEDDED_FILE=\"${MGCA_MODEL_PATH}\""
+  COMPILE_OPTIONS -fno-lto
   OBJECT_DEPENDS "${MGCA_MODEL_PATH}")
