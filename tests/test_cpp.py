@@ -20,7 +20,9 @@ import tempfile
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
+from conftest import make_scene
 
 import mgca_filter
 
@@ -140,7 +142,7 @@ def test_tool_answers_in_words_and_json(build):
         (["a.png", "b.png"], "a.png: not a readable image"),  # by the model within the library
         (["a.png", "b.png", "--model", "m.onnx", "--K", "1,2,3"], "--K: expected fx,fy,cx,cy"),
         (["a.png", "b.png", "--model", "m.onnx", "--no", "1"], "--no: unknown"),
-        (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "--method: unknown"),
+        (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "method: expected one of auto, prosac"),
         (["a.png", "b.png", "--model", "m.onnx", "--seed", "1.5"], "--seed: expected an integer"),
         (["a.png", "b.png", "--model", "m.onnx"], "m.onnx: model file not found"),
         (["a.png", "b.png", "--model", str(mgca_filter.model_path())], "a.png: not a readable image"),
@@ -166,6 +168,24 @@ def test_odometry_times_every_frame(build, image_folder, tmp_path):
     done = run(program(examples, "odometry"), image_folder, mgca_filter.model_path(), "800,800,319.5,239.5")
     assert done.returncode == 0, done.stderr
     assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+
+
+def test_c_interface_from_python(build, tmp_path):
+    """The code of the page, run: the answer is Python's own."""
+    page = (ROOT / "docs" / "cpp.md").read_text(encoding="utf-8")
+    (tmp_path / "program.py").write_text(re.search(r"```python\n(import ctypes.*?)```", page, re.DOTALL)[1])
+    scene = make_scene("wide", right=150)
+    points = np.stack([scene.points1, scene.points2])
+    np.savetxt(tmp_path / "points.txt", points.reshape(-1, 2), fmt="%.17g")
+    (library,) = (build / "tests").glob("libmgca_shared.*")
+    done = run(sys.executable, tmp_path / "program.py", library, tmp_path / "points.txt")
+    assert done.returncode == 0, done.stderr
+    K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
+    expected = mgca_filter.filter_matches(*points, None, K1=K, threshold=1.5)
+    verdict, translation = done.stdout.splitlines()
+    assert (verdict.split()[0], expected.ok) == (expected.status, True)
+    assert abs(int(verdict.split()[1]) - expected.num_inliers) <= 3
+    assert np.dot(np.array(translation.split(), float), expected.t) > np.cos(np.radians(0.2))
 
 
 def test_opencv_4_alone_is_refused(build, tmp_path):

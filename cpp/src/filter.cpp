@@ -12,6 +12,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <initializer_list>
 #include <string_view>
 #include <utility>
 
@@ -72,6 +73,18 @@ detail::Mask keep_by_scores(const detail::PairInput& pair, const std::vector<flo
     return kept;
 }
 
+template <typename Value>
+Value by_word(const char* name, const std::string& word, std::initializer_list<std::pair<const char*, Value>> values) {
+    std::string words;
+    for (const auto& [known, value] : values) {
+        if (word == known) {
+            return value;
+        }
+        words += (words.empty() ? "" : ", ") + std::string(known);
+    }
+    throw ArgumentError(std::string(name) + ": expected one of " + words + ", got '" + word + "'");
+}
+
 }  // namespace
 
 const char* to_string(Status status) noexcept {
@@ -86,6 +99,36 @@ const char* to_string(Status status) noexcept {
         case Status::suspicious_intrinsics: return "suspicious_intrinsics";
     }
     return "";
+}
+
+const char* to_string(IntrinsicsSource source) noexcept {
+    switch (source) {
+        case IntrinsicsSource::given: return "given";
+        case IntrinsicsSource::estimated: return "estimated";
+        case IntrinsicsSource::guessed: return "guessed";
+    }
+    return "";
+}
+
+Method to_method(const std::string& word) {
+    return by_word<Method>("method", word,
+                           {{"auto", Method::automatic},
+                            {"prosac", Method::prosac},
+                            {"magsac", Method::magsac},
+                            {"ransac", Method::ransac},
+                            {"none", Method::none}});
+}
+
+Effort to_effort(const std::string& word) {
+    return by_word<Effort>("effort", word, {{"auto", Effort::automatic}, {"full", Effort::full}});
+}
+
+Geometry to_geometry(const std::string& word) {
+    return by_word<Geometry>("geometry", word,
+                             {{"auto", Geometry::automatic},
+                              {"essential", Geometry::essential},
+                              {"fundamental", Geometry::fundamental},
+                              {"homography", Geometry::homography}});
 }
 
 Model Model::from_file(const std::filesystem::path& file, const RuntimeOptions& options) {

@@ -3,6 +3,8 @@
 #include "check.hpp"
 #include "golden_files.hpp"
 
+#include <mgca/mgca.h>
+
 #include <atomic>
 #include <fstream>
 #include <iterator>
@@ -261,6 +263,52 @@ void embedded_model_is_the_file(const Model& model, const MatchPair& pair) {
     }
 }
 
+/// What mgca.h says of a pair is what filter.hpp says.
+void c_agrees(const std::filesystem::path& file, const Model& model, const MatchPair& pair) {
+    check::equal(static_cast<int>(Status::ok), static_cast<int>(MGCA_OK), "the first status");
+    check::equal(static_cast<int>(Status::suspicious_intrinsics), static_cast<int>(MGCA_SUSPICIOUS_INTRINSICS),
+                 "the last status");
+    const Result expected = Filter(model)(pair);
+    mgca_model* c_model = nullptr;
+    mgca_filter* c_filter = nullptr;
+    mgca_pair* c_pair = nullptr;
+    mgca_result* result = nullptr;
+    mgca_model_open(file.string().c_str(), 1, nullptr, &c_model);
+    mgca_filter_create(c_model, &c_filter);
+    mgca_pair_create(&c_pair);
+    int image = 0;
+    for (const Keypoints* keypoints : {&pair.keypoints1, &pair.keypoints2}) {
+        mgca_pair_set_keypoints(c_pair, ++image, &keypoints->points[0].x, keypoints->sizes.data(),
+                                keypoints->angles.data(), keypoints->points.size());
+        mgca_pair_set_camera(c_pair, image, pair.camera1.K->val, nullptr, 0, 0.0, 0.0);
+    }
+    std::vector<std::int32_t> indices;
+    for (std::size_t i = 0; i < pair.matches.index1.size(); ++i) {
+        indices.insert(indices.end(), {pair.matches.index1[i], pair.matches.index2[i]});
+    }
+    mgca_pair_set_matches(c_pair, indices.data(), pair.matches.distances.data(), pair.matches.second_distances.data(),
+                          pair.matches.index1.size());
+    check::equal(mgca_filter_run(c_filter, c_pair, &result), static_cast<int>(MGCA_DONE), "a pair through C");
+    const std::size_t count = mgca_result_size(result);
+    check::that(std::vector<unsigned char>(mgca_result_mask(result), mgca_result_mask(result) + count) == expected.mask,
+                "C: mask");
+    check::that(std::vector<float>(mgca_result_scores(result), mgca_result_scores(result) + count) == expected.scores,
+                "C: scores");
+    check::that(cv::Matx33d(mgca_result_matrix(result, "R")) == *expected.R, "C: R");
+    check::equal(mgca_result_number(result, "confidence"), expected.confidence.value_or(-1.0), "C: confidence");
+    mgca_result_free(result);
+    mgca_pair_free(c_pair);
+    mgca_filter_free(c_filter);
+    mgca_model_close(c_model);
+}
+
+void words_are_read() {
+    check::that(mgca::to_method("magsac") == mgca::Method::magsac, "method");
+    check::that(mgca::to_effort("full") == mgca::Effort::full, "effort");
+    check::that(mgca::to_geometry("homography") == mgca::Geometry::homography, "geometry");
+    check::throws<ArgumentError>([] { mgca::to_method("poselib"); }, "expected one of auto, prosac, magsac");
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -281,5 +329,7 @@ int main(int argc, char** argv) {
     threads_share_a_filter(model, pair);
     memory_and_file_agree(file, model, pair);
     embedded_model_is_the_file(model, pair);
+    c_agrees(file, model, pair);
+    words_are_read();
     return check::result("interface");
 }

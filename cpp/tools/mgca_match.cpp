@@ -18,7 +18,6 @@
 #include <iostream>
 #include <limits>
 #include <locale>
-#include <map>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -93,19 +92,7 @@ cv::Matx33d intrinsics(const std::string& text, const std::string& option) {
     return {k[0], 0.0, k[2], 0.0, k[1], k[3], 0.0, 0.0, 1.0};
 }
 
-template <typename Value>
-Value word(const std::string& text, const std::string& option, const std::map<std::string, Value>& words) {
-    const auto known = words.find(text);
-    if (known == words.end()) {
-        throw std::invalid_argument(option + ": unknown: '" + text + "'");
-    }
-    return known->second;
-}
-
 void set_option(Arguments& arguments, const std::string& name, const std::string& value) {
-    using mgca::Effort;
-    using mgca::Geometry;
-    using mgca::Method;
     if (name == "--model") {
         arguments.model = value;
     } else if (name == "--K") {
@@ -131,21 +118,11 @@ void set_option(Arguments& arguments, const std::string& name, const std::string
     } else if (name == "--threads") {
         arguments.runtime.threads = integer(value, name);
     } else if (name == "--method") {
-        arguments.options.method = word<Method>(value, name,
-                                                {{"auto", Method::automatic},
-                                                 {"prosac", Method::prosac},
-                                                 {"magsac", Method::magsac},
-                                                 {"ransac", Method::ransac},
-                                                 {"none", Method::none}});
+        arguments.options.method = mgca::to_method(value);
     } else if (name == "--effort") {
-        arguments.options.effort =
-            word<Effort>(value, name, {{"auto", Effort::automatic}, {"full", Effort::full}});
+        arguments.options.effort = mgca::to_effort(value);
     } else if (name == "--geometry") {
-        arguments.options.geometry = word<Geometry>(value, name,
-                                                    {{"auto", Geometry::automatic},
-                                                     {"essential", Geometry::essential},
-                                                     {"fundamental", Geometry::fundamental},
-                                                     {"homography", Geometry::homography}});
+        arguments.options.geometry = mgca::to_geometry(value);
     } else {
         throw std::invalid_argument(name + ": unknown");
     }

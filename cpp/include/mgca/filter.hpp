@@ -82,8 +82,17 @@ enum class Effort { automatic, full };
 /// the model; homography fits one and no more.
 enum class Geometry { automatic, essential, fundamental, homography };
 
+/// The values for words of the Python package: "auto", "prosac", "magsac", "ransac", "none"; "auto", "full"; "auto",
+/// "essential", "fundamental", "homography". Another word throws ArgumentError.
+MGCA_API Method to_method(const std::string& word);
+MGCA_API Effort to_effort(const std::string& word);
+MGCA_API Geometry to_geometry(const std::string& word);
+
 /// Where the intrinsics of an answer come from.
 enum class IntrinsicsSource { given, estimated, guessed };
+
+/// The word for it: "given", "estimated" or "guessed".
+MGCA_API const char* to_string(IntrinsicsSource source) noexcept;
 
 /// Settings of the filter.
 struct Options {
