@@ -165,9 +165,12 @@ def test_odometry_times_every_frame(build, image_folder, tmp_path):
     ):
         done = run(*command)
         assert done.returncode == 0, done.stdout + done.stderr
-    done = run(program(examples, "odometry"), image_folder, mgca_filter.model_path(), "800,800,319.5,239.5")
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+    for source in ("orb", "flow"):
+        done = run(program(examples, "odometry"), image_folder, "800,800,319.5,239.5", source, mgca_filter.model_path())
+        assert done.returncode == 0, done.stderr
+        assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+        assert len(re.findall(r"(?m)^\S+  [a-z_]+  \d+ of \d+  features", done.stdout)) == 3
+    assert run(program(examples, "odometry"), image_folder, "800", "orb").returncode == 2
 
 
 def test_c_interface_from_python(build, tmp_path):

@@ -34,6 +34,16 @@ if(EMBEDDED)
   endif()
 endif()
 
+file(GLOB ODOMETRY "${WORK}/find/odometry*")
+if(ODOMETRY)  # OpenCV has the modules for it
+  foreach(source orb flow)
+    run("${WORK}/find/odometry" "${SOURCE}/examples/images" 800,800,319.5,239.5 ${source} "${MODEL}")
+    if(NOT OUTPUT MATCHES "1 pairs: features and matching [0-9.]+ ms, filter [0-9.]+ ms per frame")
+      message(FATAL_ERROR "odometry ${source}: ${OUTPUT}")
+    endif()
+  endforeach()
+endif()
+
 # A version that is not there is refused.
 file(WRITE "${WORK}/newer/CMakeLists.txt"
   "cmake_minimum_required(VERSION 3.16)\nproject(newer CXX)\nfind_package(mgca 99.0 REQUIRED)\n")
