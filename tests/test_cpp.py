@@ -25,6 +25,8 @@ import pytest
 from conftest import make_scene
 
 import mgca_filter
+from benchmarks import cpp_speed
+from benchmarks.cpp_speed import CppFilter
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "cpp"
@@ -189,6 +191,16 @@ def test_c_interface_from_python(build, tmp_path):
     assert (verdict.split()[0], expected.ok) == (expected.status, True)
     assert abs(int(verdict.split()[1]) - expected.num_inliers) <= 3
     assert np.dot(np.array(translation.split(), float), expected.t) > np.cos(np.radians(0.2))
+
+
+def test_speed_is_compared_on_the_same_pairs(build):
+    pairs = cpp_speed.rendered_pairs(2, 300, supersampling=1)
+    assert {pair.full for pair in pairs} == {True, False}
+    with CppFilter(program(build, "time_pairs"), pairs) as filters:
+        times = cpp_speed.time_pairs(filters, pairs, 1)
+        assert "OpenCV" in filters.versions
+    assert all(one.cpp_ms > 0 and one.python_ms > 0 for one in times)
+    assert sum(one.agree for one in times) >= len(times) - 1
 
 
 def test_opencv_4_alone_is_refused(build, tmp_path):
