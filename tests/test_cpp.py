@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -30,6 +31,7 @@ from benchmarks.cpp_speed import CppFilter
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "cpp"
+PORT = SOURCE / "vcpkg" / "mgca"
 IMAGES = ROOT / "examples" / "images"
 _BUILDS = tempfile.TemporaryDirectory(prefix="mgca_cpp_")
 # The compiler may take minutes on a busy machine.
@@ -104,10 +106,46 @@ def test_answers_are_those_of_python_on_this_machine(build, tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_version_is_that_of_the_package():
+def test_versions_are_that_of_the_package():
     header = (SOURCE / "include" / "mgca" / "version.hpp").read_text(encoding="utf-8")
     numbers = [re.search(rf"VERSION_{part} (\d+)", header)[1] for part in ("MAJOR", "MINOR", "PATCH")]
     assert ".".join(numbers) == re.search(r'MGCA_VERSION "(.*)"', header)[1] == mgca_filter.__version__
+    assert ElementTree.parse(SOURCE / "package.xml").findtext("version") == mgca_filter.__version__
+    assert json.loads((PORT / "vcpkg.json").read_text(encoding="utf-8"))["version"] == mgca_filter.__version__
+    wanted = re.escape(".".join(mgca_filter.__version__.split(".")[:2]))
+    for user in (ROOT / "docs" / "cpp.md", ROOT / "examples" / "cpp" / "CMakeLists.txt"):
+        assert re.search(rf"find_package\(mgca {wanted} REQUIRED\)", user.read_text(encoding="utf-8"))
+
+
+def test_package_for_ros_names_what_is_there():
+    package = ElementTree.parse(SOURCE / "package.xml").getroot()
+    assert (package.get("format"), package.findtext("name"), package.findtext("license")) == ("3", "mgca", "MIT")
+    assert (SOURCE / package.find("license").get("file")).is_file()
+    assert package.findtext("export/build_type") == "cmake"
+    assert "project(mgca " in (SOURCE / "CMakeLists.txt").read_text(encoding="utf-8")
+
+
+def test_port_for_vcpkg_configures_what_is_there(tmp_path):
+    """The port runs with vcpkg's functions in words; its options and features are those of the library."""
+    port = json.loads((PORT / "vcpkg.json").read_text(encoding="utf-8"))
+    assert port["name"] == PORT.name
+    functions = re.findall(r"^ *(vcpkg_\w+)\(", (PORT / "portfile.cmake").read_text(encoding="utf-8"), re.MULTILINE)
+    (tmp_path / "run.cmake").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nset(FEATURES core tools)\nset(CURRENT_PACKAGES_DIR ${CMAKE_CURRENT_LIST_DIR})\n"
+        + "".join(f'function({name})\n  message("{name};${{ARGN}}")\nendfunction()\n' for name in functions)
+        + f'include("{PORT / "portfile.cmake"}")\n'
+    )
+    done = run("cmake", "-P", tmp_path / "run.cmake")
+    assert done.returncode == 0, done.stderr
+    calls = {words[0]: words[1:] for words in (line.split(";") for line in done.stderr.splitlines())}
+    assert "vcpkg_copy_tools" in calls
+    configured = calls["vcpkg_cmake_configure"]
+    assert Path(configured[configured.index("SOURCE_PATH") + 1]) == SOURCE
+    features = calls["vcpkg_check_features"][calls["vcpkg_check_features"].index("FEATURES") + 1 :]
+    assert set(features[::2]) == set(port["features"])
+    known = "".join(path.read_text(encoding="utf-8") for path in (SOURCE / "CMakeLists.txt", *SOURCE.glob("cmake/*")))
+    for name in [*features[1::2], *re.findall(r"-D(\w+)=", " ".join(configured))]:
+        assert re.search(rf"(option|set)\({name} ", known)
 
 
 def test_public_header_names_no_runtime():
