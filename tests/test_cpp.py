@@ -131,7 +131,8 @@ def test_port_for_vcpkg_configures_what_is_there(tmp_path):
     assert port["name"] == PORT.name
     functions = re.findall(r"^ *(vcpkg_\w+)\(", (PORT / "portfile.cmake").read_text(encoding="utf-8"), re.MULTILINE)
     (tmp_path / "run.cmake").write_text(
-        "cmake_minimum_required(VERSION 3.16)\nset(FEATURES core tools)\nset(CURRENT_PACKAGES_DIR ${CMAKE_CURRENT_LIST_DIR})\n"
+        "cmake_minimum_required(VERSION 3.16)\nset(FEATURES core tools)\n"
+        "set(CURRENT_PACKAGES_DIR ${CMAKE_CURRENT_LIST_DIR})\n"
         + "".join(f'function({name})\n  message("{name};${{ARGN}}")\nendfunction()\n' for name in functions)
         + f'include("{PORT / "portfile.cmake"}")\n'
     )

@@ -205,6 +205,12 @@ const char* mgca_model_version(const mgca_model* model) {
     return model == nullptr ? "" : model->model.version().c_str();
 }
 
+const char* mgca_model_sha256(const mgca_model* model) { return model == nullptr ? "" : model->model.sha256().c_str(); }
+
+const char* mgca_model_note(const mgca_model* model, size_t index) {
+    return model == nullptr || index >= model->model.notes().size() ? nullptr : model->model.notes()[index].c_str();
+}
+
 void mgca_model_close(mgca_model* model) { delete model; }
 
 int mgca_filter_create(const mgca_model* model, mgca_filter** filter) {
@@ -405,6 +411,9 @@ double mgca_result_number(const mgca_result* result, const char* name) {
         const std::string word = &at(name, "name");
         if (word == "num_inliers") {
             return static_cast<double>(known.num_inliers);
+        }
+        if (word == "num_accepted") {
+            return static_cast<double>(known.num_accepted);
         }
         if (word == "num_network_matches") {
             return static_cast<double>(known.num_network_matches);

@@ -6,6 +6,7 @@
 #include "network.hpp"
 #include "robust_fit.hpp"
 #include "scoring.hpp"
+#include "sha256.hpp"
 #include "verdict.hpp"
 
 #include <mgca/filter.hpp>
@@ -20,6 +21,7 @@ namespace mgca {
 
 struct Model::State {
     detail::ModelMetadata metadata;
+    std::string sha256;
     std::unique_ptr<detail::Network> network;
 };
 
@@ -57,6 +59,7 @@ std::shared_ptr<const Model::State> open_model(std::string_view content, const s
     check(options);
     auto state = std::make_shared<Model::State>();
     state->metadata = detail::read_metadata(content, source);
+    state->sha256 = detail::sha256(content);
     state->network = detail::open_network(content, source, file, options);
     return state;
 }
@@ -155,6 +158,10 @@ const std::string& Model::name() const noexcept { return state_->metadata.name; 
 
 const std::string& Model::version() const noexcept { return state_->metadata.version; }
 
+const std::string& Model::sha256() const noexcept { return state_->sha256; }
+
+const std::vector<std::string>& Model::notes() const noexcept { return state_->network->notes(); }
+
 std::string Model::runtime() { return detail::runtime_name(); }
 
 Filter::Filter(Model model, const Options& options) : model_(std::move(model)), options_(options) { check(options); }
@@ -207,6 +214,9 @@ Result Filter::operator()(const MatchPair& matches) const {
             margins.push_back(result.logits[i] - static_cast<float>(metadata.decision_threshold));
         }
         const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
+        if (output) {
+            result.network_essential = essential;
+        }
         if (evidence) {
             evidence = detail::gather_scored(pair, sent, result.scores, margins, essential);
         }
@@ -256,7 +266,11 @@ Result Filter::operator()(const MatchPair& matches) const {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }
     }
+    result.num_accepted = static_cast<int>(
+        std::count_if(result.logits.begin(), result.logits.end(),
+                      [&](float logit) { return logit > static_cast<float>(metadata.decision_threshold); }));
     if (model) {
+        result.fitted_essential = model->E;
         result.origin = model->origin;
         result.ended = model->ended;
         if (verdict.t) {

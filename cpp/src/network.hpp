@@ -30,6 +30,12 @@ public:
 
     /// One forward pass over N >= 1 matches: N rows of 4 coordinates, finite, and of 8 attributes. Throws RuntimeError.
     virtual NetworkOutput infer(std::vector<float>& correspondences, std::vector<float>& attributes) const = 0;
+
+    /// What turned out otherwise than asked for.
+    const std::vector<std::string>& notes() const { return notes_; }
+
+protected:
+    std::vector<std::string> notes_;
 };
 
 /// Open a model from its bytes; throws ModelError or RuntimeError.

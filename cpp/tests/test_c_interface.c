@@ -70,6 +70,7 @@ static void finds_the_pose(const mgca_filter *filter) {
     check(mgca_result_matrix(result, "E") != NULL && mgca_result_matrix(result, "F") != NULL, "E and F");
     check(mgca_result_matrix(result, "H") == NULL, "no H");
     check(mgca_result_number(result, "confidence") > 0.5, "confidence");
+    check(mgca_result_number(result, "num_accepted") > 0.8 * RIGHT, "num_accepted");
     check(isnan(mgca_result_number(result, "focal_px")), "no focal length is estimated");
     check(strcmp(mgca_result_word(result, "intrinsics"), "given") == 0, "intrinsics");
     check(strlen(mgca_result_word(result, "origin")) > 0, "origin");
@@ -208,6 +209,9 @@ static void models_are_checked(const char *file) {
 #endif
     mgca_model_close(model);
     mgca_model_close(NULL);
+    check(mgca_model_open(file, 1, "NoSuchExecutionProvider", &model) == MGCA_DONE, "a provider gives way");
+    check(strstr(mgca_model_note(model, 0), "has no NoSuchExecutionProvider") != NULL, "with a note");
+    mgca_model_close(model);
     mgca_filter_free(NULL);
     mgca_pair_free(NULL);
     mgca_result_free(NULL);
@@ -231,6 +235,7 @@ int main(int argc, char **argv) {
         return 1;
     }
     check(strlen(mgca_model_name(model)) > 0 && strlen(mgca_model_version(model)) > 0, "name and version");
+    check(strlen(mgca_model_sha256(model)) == 64 && mgca_model_note(model, 0) == NULL, "digest, and no notes");
     options_are_felt(model);
     mgca_model_close(model); /* the filter goes on */
     finds_the_pose(filter);

@@ -76,13 +76,42 @@ void model_files_are_checked(const std::filesystem::path& file) {
                               "early_end is missing");
     mgca::RuntimeOptions provider;
     provider.providers = {"NoSuchExecutionProvider"};
-    check::throws<mgca::Error>([&] { Model::from_file(file, provider); }, "provider");
+    provider.cpu_fallback = false;
+    check::throws<mgca::Error>([&] { Model::from_file(file, provider); }, "has no NoSuchExecutionProvider");
+    provider.cpu_fallback = true;
+    const Model given_way = Model::from_file(file, provider);
+    check::that(given_way.notes().size() == 1 &&
+                    given_way.notes()[0].find("another provider than asked for: this ONNX Runtime has no") !=
+                        std::string::npos,
+                "a provider that gives way is noted");
+    std::string renamed = content;
+    for (std::size_t at = 0; (at = renamed.find("correspondences", at)) != std::string::npos; ++at) {
+        renamed.replace(at, 15, "correspondencez");
+    }
+    check::throws<ModelError>([&] { Model::from_memory(renamed.data(), renamed.size()); }, "expected correspondences");
     // All of one family, which is also a std::runtime_error.
     check::throws<mgca::Error>([] { Model::from_file("no such file.onnx"); }, "not found");
     check::throws<std::runtime_error>([] { Model::from_file("no such file.onnx"); }, "not found");
 }
 
+/// SHA256SUMS beside a file, as sha256sum writes it.
+void sums_are_checked(const std::filesystem::path& file, const Model& model) {
+    const std::filesystem::path folder = std::filesystem::temp_directory_path() / "mgca_test_sums";
+    std::filesystem::create_directories(folder);
+    const std::filesystem::path copy = folder / "model.onnx";
+    std::filesystem::copy_file(file, copy, std::filesystem::copy_options::overwrite_existing);
+    const auto with_sum = [&](const std::string& line) {
+        std::ofstream(folder / "SHA256SUMS") << std::string(64, '0') << "  other.onnx\n" << line;
+        return Model::from_file(copy).sha256();
+    };
+    check::equal(with_sum(model.sha256() + "  model.onnx\n"), model.sha256(), "the sum that is listed");
+    check::equal(with_sum(""), model.sha256(), "a file that is not listed is not compared");
+    check::throws<ModelError>([&] { with_sum(std::string(64, '1') + "  model.onnx\n"); }, "damaged or replaced");
+    std::filesystem::remove_all(folder);
+}
+
 void models_are_named(const Model& model) {
+    check::that(model.notes().empty(), "nothing is noted where nothing was asked for");
     check::that(!model.name().empty() && !model.version().empty(), "name and version of the model");
     check::that(!Model::runtime().empty(), "name of the runtime");
     check::equal(std::string(MGCA_VERSION),
@@ -169,6 +198,10 @@ void options_are_felt(const Model& model, const MatchPair& pair) {
     const Result plain = answer([](Options&) {});
     check::that(plain.ok() && plain.num_network_matches > 0, "the pair goes through the network");
     check::that(same(plain, answer([](Options&) {})), "same options, same answer");
+    check::that(plain.num_accepted > 0 && plain.network_essential && plain.fitted_essential, "what the network said");
+    const cv::Vec4d moved = *plain.relative_pose(2.5) * cv::Vec4d(0.0, 0.0, 0.0, 1.0);
+    check::near(cv::norm(cv::Vec3d(moved[0], moved[1], moved[2]) - 2.5 * *plain.t), 0.0, 1e-12, "relative pose");
+    check::that(!Result().relative_pose(), "no pose, no matrix");
     check::that(answer([](Options& o) { o.threshold = 0.3; }).num_inliers < plain.num_inliers, "threshold is felt");
     check::that(answer([](Options& o) { o.keep_precision = 0.999; }).mask != plain.mask, "keep_precision is felt");
     // One estimator alone, whose answer no other outvotes.
@@ -322,6 +355,7 @@ int main(int argc, char** argv) {
     options_are_checked(model);
     model_files_are_checked(file);
     models_are_named(model);
+    sums_are_checked(file, model);
     inputs_are_checked(model, golden::read_input(golden, "general"));
     data_never_throws(model);
     options_are_felt(model, pair);

@@ -56,7 +56,7 @@ def single_header() -> str:
     licence = (CPP.parent / "LICENSE").read_text(encoding="utf-8")
     parts = [
         "// mgca_filter for C++ in one file, written by cpp/tools/single_header.py. Define MGCA_IMPLEMENTATION in one\n"
-        "// source file before including it: that one needs ONNX Runtime, or with MGCA_OPENCV_DNN OpenCV 5's dnn.\n//\n",
+        "// source file before including it: that one needs ONNX Runtime, or with MGCA_OPENCV_DNN OpenCV 5.\n//\n",
         "".join(f"// {line}".rstrip() + "\n" for line in licence.strip().splitlines()),
         "\n#pragma once\n\n",
         inlined(CPP / "include" / "mgca" / "filter.hpp", seen),

@@ -74,7 +74,7 @@ MGCA_C_API const char *mgca_status_word(int status);
 
 /* Open an ONNX file of mgca_filter; NULL = the model within the library, where it was built with one.
  * threads: of one forward pass, 0 = as many as there are cores. providers: execution providers of ONNX Runtime, the
- * preferred first, separated by commas; NULL = CPU. */
+ * preferred first, separated by commas; NULL = CPU. One that is missing or cannot start gives way to the CPU, with a note. */
 MGCA_C_API int mgca_model_open(const char *file, int threads, const char *providers, mgca_model **model);
 
 /* The same from the bytes of a file. */
@@ -83,6 +83,11 @@ MGCA_C_API int mgca_model_open_memory(const void *data, size_t size, int threads
 
 MGCA_C_API const char *mgca_model_name(const mgca_model *model);
 MGCA_C_API const char *mgca_model_version(const mgca_model *model);
+MGCA_C_API const char *mgca_model_sha256(const mgca_model *model);
+
+/* A sentence on what turned out otherwise than asked for, from index 0 on; NULL behind the last. */
+MGCA_C_API const char *mgca_model_note(const mgca_model *model, size_t index);
+
 MGCA_C_API void mgca_model_close(mgca_model *model);
 
 /* Filters ---------------------------------------------------------------------------------------------------------- */
@@ -160,7 +165,7 @@ MGCA_C_API const double *mgca_result_matrix(const mgca_result *result, const cha
 /* Three numbers of unit length; NULL where there is none. */
 MGCA_C_API const double *mgca_result_translation(const mgca_result *result);
 
-/* "num_inliers", "confidence", "num_network_matches", "support", "log10_false_alarms", "translation_sigma_deg",
+/* "num_inliers", "num_accepted", "confidence", "num_network_matches", "support", "log10_false_alarms", "translation_sigma_deg",
  * "focal_px", "focal_sigma" or "focal_factor"; NaN where there is none. */
 MGCA_C_API double mgca_result_number(const mgca_result *result, const char *name);
 
