@@ -18,14 +18,20 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
+import numpy as np
 import pytest
+from conftest import make_scene
 
 import mgca_filter
+from benchmarks import cpp_speed
+from benchmarks.cpp_speed import CppFilter
 
 ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "cpp"
+PORT = SOURCE / "vcpkg" / "mgca"
 IMAGES = ROOT / "examples" / "images"
 _BUILDS = tempfile.TemporaryDirectory(prefix="mgca_cpp_")
 # The compiler may take minutes on a busy machine.
@@ -102,10 +108,47 @@ def test_answers_are_those_of_python_on_this_machine(build, tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_version_is_that_of_the_package():
+def test_versions_are_that_of_the_package():
     header = (SOURCE / "include" / "mgca" / "version.hpp").read_text(encoding="utf-8")
     numbers = [re.search(rf"VERSION_{part} (\d+)", header)[1] for part in ("MAJOR", "MINOR", "PATCH")]
     assert ".".join(numbers) == re.search(r'MGCA_VERSION "(.*)"', header)[1] == mgca_filter.__version__
+    assert ElementTree.parse(SOURCE / "package.xml").findtext("version") == mgca_filter.__version__
+    assert json.loads((PORT / "vcpkg.json").read_text(encoding="utf-8"))["version"] == mgca_filter.__version__
+    wanted = re.escape(".".join(mgca_filter.__version__.split(".")[:2]))
+    for user in (ROOT / "docs" / "cpp.md", ROOT / "examples" / "cpp" / "CMakeLists.txt"):
+        assert re.search(rf"find_package\(mgca {wanted} REQUIRED\)", user.read_text(encoding="utf-8"))
+
+
+def test_package_for_ros_names_what_is_there():
+    package = ElementTree.parse(SOURCE / "package.xml").getroot()
+    assert (package.get("format"), package.findtext("name"), package.findtext("license")) == ("3", "mgca", "MIT")
+    assert (SOURCE / package.find("license").get("file")).is_file()
+    assert package.findtext("export/build_type") == "cmake"
+    assert "project(mgca " in (SOURCE / "CMakeLists.txt").read_text(encoding="utf-8")
+
+
+def test_port_for_vcpkg_configures_what_is_there(tmp_path):
+    """The port runs with vcpkg's functions in words; its options and features are those of the library."""
+    port = json.loads((PORT / "vcpkg.json").read_text(encoding="utf-8"))
+    assert port["name"] == PORT.name
+    functions = re.findall(r"^ *(vcpkg_\w+)\(", (PORT / "portfile.cmake").read_text(encoding="utf-8"), re.MULTILINE)
+    (tmp_path / "run.cmake").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nset(FEATURES core tools)\n"
+        "set(CURRENT_PACKAGES_DIR ${CMAKE_CURRENT_LIST_DIR})\n"
+        + "".join(f'function({name})\n  message("{name};${{ARGN}}")\nendfunction()\n' for name in functions)
+        + f'include("{PORT / "portfile.cmake"}")\n'
+    )
+    done = run("cmake", "-P", tmp_path / "run.cmake")
+    assert done.returncode == 0, done.stderr
+    calls = {words[0]: words[1:] for words in (line.split(";") for line in done.stderr.splitlines())}
+    assert "vcpkg_copy_tools" in calls
+    configured = calls["vcpkg_cmake_configure"]
+    assert Path(configured[configured.index("SOURCE_PATH") + 1]) == SOURCE
+    features = calls["vcpkg_check_features"][calls["vcpkg_check_features"].index("FEATURES") + 1 :]
+    assert set(features[::2]) == set(port["features"])
+    known = "".join(path.read_text(encoding="utf-8") for path in (SOURCE / "CMakeLists.txt", *SOURCE.glob("cmake/*")))
+    for name in [*features[1::2], *re.findall(r"-D(\w+)=", " ".join(configured))]:
+        assert re.search(rf"(option|set)\({name} ", known)
 
 
 def test_public_header_names_no_runtime():
@@ -141,10 +184,10 @@ def test_tool_answers_in_words_and_json(build):
     ("words", "message"),
     [
         ([], "expected two images"),
-        (["a.png", "b.png"], "expected --model"),
+        (["a.png", "b.png"], "a.png: not a readable image"),  # by the model within the library
         (["a.png", "b.png", "--model", "m.onnx", "--K", "1,2,3"], "--K: expected fx,fy,cx,cy"),
         (["a.png", "b.png", "--model", "m.onnx", "--no", "1"], "--no: unknown"),
-        (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "--method: unknown"),
+        (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "method: expected one of auto, prosac"),
         (["a.png", "b.png", "--model", "m.onnx", "--seed", "1.5"], "--seed: expected an integer"),
         (["a.png", "b.png", "--model", "m.onnx"], "m.onnx: model file not found"),
         (["a.png", "b.png", "--model", str(mgca_filter.model_path())], "a.png: not a readable image"),
@@ -168,9 +211,40 @@ def test_odometry_times_every_frame(build, image_folder, tmp_path):
     ):
         done = run(*command)
         assert done.returncode == 0, done.stdout + done.stderr
-    done = run(program(examples, "odometry"), image_folder, mgca_filter.model_path(), "800,800,319.5,239.5")
+    for source in ("orb", "flow"):
+        done = run(program(examples, "odometry"), image_folder, "800,800,319.5,239.5", source, mgca_filter.model_path())
+        assert done.returncode == 0, done.stderr
+        assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+        assert len(re.findall(r"(?m)^\S+  [a-z_]+  \d+ of \d+  features", done.stdout)) == 3
+    assert run(program(examples, "odometry"), image_folder, "800", "orb").returncode == 2
+
+
+def test_c_interface_from_python(build, tmp_path):
+    """The code of the page, run: the answer is Python's own."""
+    page = (ROOT / "docs" / "cpp.md").read_text(encoding="utf-8")
+    (tmp_path / "program.py").write_text(re.search(r"```python\n(import ctypes.*?)```", page, re.DOTALL)[1])
+    scene = make_scene("wide", right=150)
+    points = np.stack([scene.points1, scene.points2])
+    np.savetxt(tmp_path / "points.txt", points.reshape(-1, 2), fmt="%.17g")
+    (library,) = (build / "tests").glob("libmgca_shared.*")
+    done = run(sys.executable, tmp_path / "program.py", library, tmp_path / "points.txt")
     assert done.returncode == 0, done.stderr
-    assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
+    K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
+    expected = mgca_filter.filter_matches(*points, None, K1=K, threshold=1.5)
+    verdict, translation = done.stdout.splitlines()
+    assert (verdict.split()[0], expected.ok) == (expected.status, True)
+    assert abs(int(verdict.split()[1]) - expected.num_inliers) <= 3
+    assert np.dot(np.array(translation.split(), float), expected.t) > np.cos(np.radians(0.2))
+
+
+def test_speed_is_compared_on_the_same_pairs(build):
+    pairs = cpp_speed.rendered_pairs(2, 300, supersampling=1)
+    assert {pair.full for pair in pairs} == {True, False}
+    with CppFilter(program(build, "time_pairs"), pairs) as filters:
+        times = cpp_speed.time_pairs(filters, pairs, 1)
+        assert "OpenCV" in filters.versions
+    assert all(one.cpp_ms > 0 and one.python_ms > 0 for one in times)
+    assert sum(one.agree for one in times) >= len(times) - 1
 
 
 @pytest.mark.slow

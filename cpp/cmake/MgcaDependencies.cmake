@@ -1,5 +1,8 @@
 # OpenCV's modules that the library needs, and the runtime of the network.
 #
+# No package that the tests could install brings OpenCV 5 with headers: MGCA_RUNTIME=opencv was compiled against the headers
+# of its source archive, and is otherwise untested. ONNX Runtime is preferred where both are there.
+#
 # Sets MGCA_OPENCV_LIBRARIES, MGCA_OPENCV_COMPONENTS and MGCA_CHOSEN_RUNTIME (onnxruntime or opencv).
 
 find_package(OpenCV REQUIRED COMPONENTS core)
@@ -26,7 +29,7 @@ endif()
 if(NOT MGCA_CHOSEN_RUNTIME AND NOT MGCA_RUNTIME STREQUAL "onnxruntime" AND OpenCV_VERSION VERSION_GREATER_EQUAL 5)
   set(MGCA_CHOSEN_RUNTIME opencv)
   list(APPEND MGCA_OPENCV_COMPONENTS dnn)
-  message(STATUS "mgca runs on cv::dnn of OpenCV ${OpenCV_VERSION}")
+  message(STATUS "mgca runs on cv::dnn of OpenCV ${OpenCV_VERSION}, which its authors compiled and could not run")
 endif()
 if(NOT MGCA_CHOSEN_RUNTIME)
   message(FATAL_ERROR

@@ -9,6 +9,7 @@ install(TARGETS mgca_filter EXPORT mgcaTargets
   RUNTIME DESTINATION "${CMAKE_INSTALL_BINDIR}")
 install(DIRECTORY include/mgca DESTINATION "${CMAKE_INSTALL_INCLUDEDIR}")
 install(EXPORT mgcaTargets NAMESPACE mgca:: DESTINATION "${MGCA_CMAKE_DIR}")
+install(FILES package.xml DESTINATION "${CMAKE_INSTALL_DATADIR}/mgca")  # for ROS
 if(TARGET mgca_match)
   install(TARGETS mgca_match RUNTIME DESTINATION "${CMAKE_INSTALL_BINDIR}")
 endif()

@@ -1,22 +1,27 @@
 // The public door; the flow of one pair, one call per step, in order; mgca_filter/match_filter.py.
 
+#include "embedded_model.hpp"
 #include "focal_estimate.hpp"
 #include "model_file.hpp"
 #include "network.hpp"
 #include "robust_fit.hpp"
 #include "scoring.hpp"
+#include "sha256.hpp"
 #include "verdict.hpp"
 
 #include <mgca/filter.hpp>
 
 #include <algorithm>
 #include <cmath>
+#include <initializer_list>
+#include <string_view>
 #include <utility>
 
 namespace mgca {
 
 struct Model::State {
     detail::ModelMetadata metadata;
+    std::string sha256;
     std::unique_ptr<detail::Network> network;
 };
 
@@ -49,11 +54,12 @@ void check(const RuntimeOptions& options) {
     }
 }
 
-std::shared_ptr<const Model::State> open_model(const std::string& content, const std::string& source,
+std::shared_ptr<const Model::State> open_model(std::string_view content, const std::string& source,
                                                const std::filesystem::path& file, const RuntimeOptions& options) {
     check(options);
     auto state = std::make_shared<Model::State>();
     state->metadata = detail::read_metadata(content, source);
+    state->sha256 = detail::sha256(content);
     state->network = detail::open_network(content, source, file, options);
     return state;
 }
@@ -68,6 +74,18 @@ detail::Mask keep_by_scores(const detail::PairInput& pair, const std::vector<flo
         kept[i] = scores[i] > 0.5F && pair.valid[i] != 0 ? 1 : 0;
     }
     return kept;
+}
+
+template <typename Value>
+Value by_word(const char* name, const std::string& word, std::initializer_list<std::pair<const char*, Value>> values) {
+    std::string words;
+    for (const auto& [known, value] : values) {
+        if (word == known) {
+            return value;
+        }
+        words += (words.empty() ? "" : ", ") + std::string(known);
+    }
+    throw ArgumentError(std::string(name) + ": expected one of " + words + ", got '" + word + "'");
 }
 
 }  // namespace
@@ -86,6 +104,36 @@ const char* to_string(Status status) noexcept {
     return "";
 }
 
+const char* to_string(IntrinsicsSource source) noexcept {
+    switch (source) {
+        case IntrinsicsSource::given: return "given";
+        case IntrinsicsSource::estimated: return "estimated";
+        case IntrinsicsSource::guessed: return "guessed";
+    }
+    return "";
+}
+
+Method to_method(const std::string& word) {
+    return by_word<Method>("method", word,
+                           {{"auto", Method::automatic},
+                            {"prosac", Method::prosac},
+                            {"magsac", Method::magsac},
+                            {"ransac", Method::ransac},
+                            {"none", Method::none}});
+}
+
+Effort to_effort(const std::string& word) {
+    return by_word<Effort>("effort", word, {{"auto", Effort::automatic}, {"full", Effort::full}});
+}
+
+Geometry to_geometry(const std::string& word) {
+    return by_word<Geometry>("geometry", word,
+                             {{"auto", Geometry::automatic},
+                              {"essential", Geometry::essential},
+                              {"fundamental", Geometry::fundamental},
+                              {"homography", Geometry::homography}});
+}
+
 Model Model::from_file(const std::filesystem::path& file, const RuntimeOptions& options) {
     return Model(open_model(detail::read_model_file(file), file.string(), file, options));
 }
@@ -94,12 +142,25 @@ Model Model::from_memory(const void* data, std::size_t size, const RuntimeOption
     if (data == nullptr) {
         throw ArgumentError("data: expected the bytes of a model file");
     }
-    return Model(open_model(std::string(static_cast<const char*>(data), size), "model in memory", {}, options));
+    return Model(open_model({static_cast<const char*>(data), size}, "model in memory", {}, options));
+}
+
+bool has_embedded_model() noexcept { return !detail::embedded_model().empty(); }
+
+Model embedded_model(const RuntimeOptions& options) {
+    if (!has_embedded_model()) {
+        throw ModelError("this library was built without a model in it (MGCA_EMBED_MODEL=ON); use Model::from_file");
+    }
+    return Model(open_model(detail::embedded_model(), "embedded model", {}, options));
 }
 
 const std::string& Model::name() const noexcept { return state_->metadata.name; }
 
 const std::string& Model::version() const noexcept { return state_->metadata.version; }
+
+const std::string& Model::sha256() const noexcept { return state_->sha256; }
+
+const std::vector<std::string>& Model::notes() const noexcept { return state_->network->notes(); }
 
 std::string Model::runtime() { return detail::runtime_name(); }
 
@@ -153,6 +214,9 @@ Result Filter::operator()(const MatchPair& matches) const {
             margins.push_back(result.logits[i] - static_cast<float>(metadata.decision_threshold));
         }
         const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
+        if (output) {
+            result.network_essential = essential;
+        }
         if (evidence) {
             evidence = detail::gather_scored(pair, sent, result.scores, margins, essential);
         }
@@ -202,7 +266,11 @@ Result Filter::operator()(const MatchPair& matches) const {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }
     }
+    result.num_accepted = static_cast<int>(
+        std::count_if(result.logits.begin(), result.logits.end(),
+                      [&](float logit) { return logit > static_cast<float>(metadata.decision_threshold); }));
     if (model) {
+        result.fitted_essential = model->E;
         result.origin = model->origin;
         result.ended = model->ended;
         if (verdict.t) {

@@ -1,6 +1,7 @@
 #include "model_file.hpp"
 
 #include "json.hpp"
+#include "sha256.hpp"
 
 #include <mgca/filter.hpp>
 
@@ -17,6 +18,7 @@ namespace mgca::detail {
 namespace {
 
 constexpr const char* kContractVersion = "2";
+constexpr const char* kSumsName = "SHA256SUMS";
 // The largest preset takes 20 MB; more than this is another file, and is not read into memory.
 constexpr std::uintmax_t kMaxModelBytes = std::uintmax_t{1} << 29U;
 
@@ -112,6 +114,18 @@ AttributePrior read_prior(const Json& values) {
     return prior;
 }
 
+/// The digest of a file that SHA256SUMS in its folder lists; empty without one.
+std::string listed_sum(const std::filesystem::path& file) {
+    std::ifstream sums(file.parent_path() / kSumsName);
+    const std::string name = file.filename().string();
+    for (std::string digest, listed; sums >> digest >> std::ws && std::getline(sums, listed);) {
+        if (listed == name) {
+            return digest;
+        }
+    }
+    return "";
+}
+
 }  // namespace
 
 ModelMetadata read_metadata(std::string_view content, const std::string& source) {
@@ -175,6 +189,11 @@ std::string read_model_file(const std::filesystem::path& file) {
     std::string content{std::istreambuf_iterator<char>(stream), {}};
     if (content.size() != size) {
         throw ModelError(file.string() + ": model file cannot be read");
+    }
+    const std::string sum = listed_sum(file);
+    if (!sum.empty() && sum != sha256(content)) {
+        throw ModelError(file.string() + ": damaged or replaced, its SHA-256 is not the one in " +
+                         (file.parent_path() / kSumsName).string());
     }
     return content;
 }

@@ -27,7 +27,8 @@ struct ModelMetadata {
 ///     contract.
 ModelMetadata read_metadata(std::string_view content, const std::string& source);
 
-/// The bytes of a model file; throws ModelError.
+/// The bytes of a model file; throws ModelError, also where the SHA256SUMS beside it lists another file of this name. A file
+/// that is not listed, a user's own model, is not compared.
 std::string read_model_file(const std::filesystem::path& file);
 
 }  // namespace mgca::detail

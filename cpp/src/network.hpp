@@ -9,6 +9,7 @@
 
 #include <memory>
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace mgca::detail {
@@ -29,12 +30,18 @@ public:
 
     /// One forward pass over N >= 1 matches: N rows of 4 coordinates, finite, and of 8 attributes. Throws RuntimeError.
     virtual NetworkOutput infer(std::vector<float>& correspondences, std::vector<float>& attributes) const = 0;
+
+    /// What turned out otherwise than asked for.
+    const std::vector<std::string>& notes() const { return notes_; }
+
+protected:
+    std::vector<std::string> notes_;
 };
 
 /// Open a model from its bytes; throws ModelError or RuntimeError.
 ///
 /// @param source what messages call it. file: where the bytes were read, or empty.
-std::unique_ptr<Network> open_network(const std::string& content, const std::string& source,
+std::unique_ptr<Network> open_network(std::string_view content, const std::string& source,
                                       const std::filesystem::path& file, const RuntimeOptions& options);
 
 /// Name and version of the runtime.

@@ -5,6 +5,7 @@
 
 #include <onnxruntime_cxx_api.h>
 
+#include <algorithm>
 #include <array>
 #include <cstdint>
 #include <exception>
@@ -13,6 +14,7 @@
 namespace mgca::detail {
 namespace {
 
+constexpr const char* kCpu = "CPUExecutionProvider";
 constexpr std::array<const char*, 2> kInputNames{"correspondences", "attributes"};
 constexpr std::array<const char*, 2> kOutputNames{"logits", "essential"};
 
@@ -28,7 +30,6 @@ Ort::Env make_environment() {
 }
 
 void append_provider(Ort::SessionOptions& session, const std::string& name, const RuntimeOptions& options) {
-    constexpr const char* kCpu = "CPUExecutionProvider";
     if (name == kCpu) {
         return;
     }
@@ -58,33 +59,63 @@ void append_provider(Ort::SessionOptions& session, const std::string& name, cons
     session.AppendExecutionProvider(is_long ? name.substr(0, name.size() - suffix.size()) : name, settings);
 }
 
+/// Throws ModelError where the graph lacks one of the names.
+template <typename Name>
+void check_names(const char* what, const std::array<const char*, 2>& expected, std::size_t count,
+                 const std::string& source, const Name& name_of) {
+    std::string names;
+    std::size_t found = 0;
+    for (std::size_t i = 0; i < count; ++i) {
+        const auto name = name_of(i);
+        found += std::count(expected.begin(), expected.end(), std::string_view(name.get())) > 0 ? 1 : 0;
+        names += (names.empty() ? "" : ", ") + std::string(name.get());
+    }
+    if (found != expected.size()) {
+        throw ModelError(source + ": " + what + " " + names + ", expected " + expected[0] + ", " + expected[1]);
+    }
+}
+
 class OnnxNetwork : public Network {
 public:
-    OnnxNetwork(const std::string& content, const std::string& source, const RuntimeOptions& options)
+    OnnxNetwork(std::string_view content, const std::string& source, const RuntimeOptions& options)
         : environment_(make_environment()), session_(nullptr) {
-        Ort::SessionOptions session;
+        std::vector<std::string> usable;
+        std::string missing, reason;
+        const std::vector<std::string> available = Ort::GetAvailableProviders();
         for (const std::string& name : options.providers) {
-            try {
-                append_provider(session, name, options);
-            } catch (const Ort::Exception& error) {
-                throw RuntimeError("providers: " + name + " cannot start (" + error.what() + ")");
+            if (std::find(available.begin(), available.end(), name) != available.end()) {
+                usable.push_back(name);
+            } else {
+                missing += (missing.empty() ? "" : ", ") + name;
             }
         }
-        try {
-            session.SetIntraOpNumThreads(options.threads);
-            session.SetInterOpNumThreads(1);
-            // Threads that wait for the next pass would take the processor from the robust fit.
-            session.AddConfigEntry("session.force_spinning_stop", "1");
-            // The product that this fusion makes rounds by the number of threads, and a rounding may move logits by
-            // tenths; Python leaves it out as well.
-            session.AddConfigEntry("optimization.disable_specified_optimizers", "MatMulScaleFusion");
-            session_ = Ort::Session(environment_, content.data(), content.size(), session);
-        } catch (const Ort::Exception& error) {
-            const std::string what = "ONNX Runtime cannot open the model (" + std::string(error.what()) + ")";
-            if (!options.providers.empty()) {
-                throw RuntimeError(source + ": " + what);
+        if (!missing.empty()) {
+            reason = "this ONNX Runtime has no " + missing;
+            refuse(options, reason);
+        }
+        if (!usable.empty() && usable != std::vector<std::string>{kCpu}) {
+            try {
+                session_ = open(content, usable, options);
+            } catch (const Ort::Exception& error) {
+                reason = usable[0] + " failed (" + error.what() + ")";
+                refuse(options, reason);
             }
-            throw ModelError(source + ": " + what);
+        }
+        if (!reason.empty()) {
+            notes_.push_back("mgca runs on another provider than asked for: " + reason);
+        }
+        try {
+            if (static_cast<OrtSession*>(session_) == nullptr) {
+                session_ = open(content, {}, options);
+            }
+            check_names("inputs", kInputNames, session_.GetInputCount(), source, [this](std::size_t i) {
+                return session_.GetInputNameAllocated(i, Ort::AllocatorWithDefaultOptions());
+            });
+            check_names("outputs", kOutputNames, session_.GetOutputCount(), source, [this](std::size_t i) {
+                return session_.GetOutputNameAllocated(i, Ort::AllocatorWithDefaultOptions());
+            });
+        } catch (const Ort::Exception& error) {
+            throw ModelError(source + ": ONNX Runtime cannot open the model (" + error.what() + ")");
         }
     }
 
@@ -109,6 +140,28 @@ public:
     }
 
 private:
+    static void refuse(const RuntimeOptions& options, const std::string& reason) {
+        if (!options.cpu_fallback) {
+            throw RuntimeError("providers: " + reason);
+        }
+    }
+
+    Ort::Session open(std::string_view content, const std::vector<std::string>& providers,
+                      const RuntimeOptions& options) {
+        Ort::SessionOptions session;
+        for (const std::string& name : providers) {
+            append_provider(session, name, options);
+        }
+        session.SetIntraOpNumThreads(options.threads);
+        session.SetInterOpNumThreads(1);
+        // Threads that wait for the next pass would take the processor from the robust fit.
+        session.AddConfigEntry("session.force_spinning_stop", "1");
+        // The product that this fusion makes rounds by the number of threads, and a rounding may move logits by tenths;
+        // Python leaves it out as well.
+        session.AddConfigEntry("optimization.disable_specified_optimizers", "MatMulScaleFusion");
+        return Ort::Session(environment_, content.data(), content.size(), session);
+    }
+
     // The session must not outlive the environment: members are destroyed in reverse order.
     Ort::Env environment_;
     mutable Ort::Session session_;  // its Run is thread-safe, but not declared const
@@ -116,7 +169,7 @@ private:
 
 }  // namespace
 
-std::unique_ptr<Network> open_network(const std::string& content, const std::string& source,
+std::unique_ptr<Network> open_network(std::string_view content, const std::string& source,
                                       const std::filesystem::path& /*file*/, const RuntimeOptions& options) {
     return std::make_unique<OnnxNetwork>(content, source, options);
 }

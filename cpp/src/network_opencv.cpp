@@ -13,7 +13,7 @@ namespace {
 
 class OpenCvNetwork : public Network {
 public:
-    OpenCvNetwork(const std::string& content, const std::string& source, const std::filesystem::path& file) {
+    OpenCvNetwork(std::string_view content, const std::string& source, const std::filesystem::path& file) {
         try {
             // From the path where there is one: the overload that reads a buffer does not heed the engine.
             net_ = file.empty() ? cv::dnn::readNetFromONNX(content.data(), content.size(), cv::dnn::ENGINE_NEW)
@@ -46,7 +46,7 @@ private:
 
 }  // namespace
 
-std::unique_ptr<Network> open_network(const std::string& content, const std::string& source,
+std::unique_ptr<Network> open_network(std::string_view content, const std::string& source,
                                       const std::filesystem::path& file, const RuntimeOptions& options) {
     if (!options.providers.empty()) {
         throw ArgumentError("providers: this library was built on cv::dnn, which has none");

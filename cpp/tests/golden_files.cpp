@@ -104,20 +104,11 @@ mgca::Options read_options(const Json& values) {
     mgca::Options options;
     for (const auto& [name, value] : values.members()) {
         if (name == "effort") {
-            options.effort = value.text() == "full" ? mgca::Effort::full : mgca::Effort::automatic;
+            options.effort = mgca::to_effort(value.text());
         } else if (name == "method") {
-            const std::string& method = value.text();
-            options.method = method == "prosac"   ? mgca::Method::prosac
-                             : method == "magsac" ? mgca::Method::magsac
-                             : method == "ransac" ? mgca::Method::ransac
-                             : method == "none"   ? mgca::Method::none
-                                                  : mgca::Method::automatic;
+            options.method = mgca::to_method(value.text());
         } else if (name == "geometry") {
-            const std::string& geometry = value.text();
-            options.geometry = geometry == "essential"     ? mgca::Geometry::essential
-                               : geometry == "fundamental" ? mgca::Geometry::fundamental
-                               : geometry == "homography"  ? mgca::Geometry::homography
-                                                           : mgca::Geometry::automatic;
+            options.geometry = mgca::to_geometry(value.text());
         } else if (name == "threshold") {
             options.threshold = value.number();
         } else if (name == "confidence") {

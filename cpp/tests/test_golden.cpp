@@ -51,9 +51,7 @@ public:
 
 private:
     void facts() const {
-        const std::string source = result_.intrinsics == mgca::IntrinsicsSource::given       ? "given"
-                                   : result_.intrinsics == mgca::IntrinsicsSource::estimated ? "estimated"
-                                                                                             : "guessed";
+        const std::string source = mgca::to_string(result_.intrinsics);
         check::equal(source, expected_["intrinsics"].text(), name_ + ": intrinsics");
         const std::vector<Json>& assumptions = expected_["assumptions"].items();
         if (check::equal(result_.assumptions.size(), assumptions.size(), name_ + ": assumptions")) {

@@ -1,6 +1,6 @@
 # Install what was built, and link programs of a user's own to it: by find_package, by pkg-config, by FetchContent.
 #
-# cmake -D BUILD=... -D CONFIG=... -D SOURCE=... -D MODEL=... -D GENERATOR=... -D ROOT=... -P test_install.cmake
+# cmake -D BUILD=... -D CONFIG=... -D SOURCE=... -D MODEL=... -D GENERATOR=... -D ROOT=... -D EMBEDDED=ON -P test_install.cmake
 
 set(WORK "${BUILD}/install_test")
 file(REMOVE_RECURSE "${WORK}")
@@ -25,6 +25,23 @@ run(${CMAKE_COMMAND} --build "${WORK}/find" --config "${CONFIG}")
 run("${WORK}/find/filter_matches" "${MODEL}")
 if(NOT OUTPUT MATCHES "^ok: ")
   message(FATAL_ERROR "filter_matches: ${OUTPUT}")
+endif()
+
+if(EMBEDDED)
+  run("${WORK}/find/filter_matches")
+  if(NOT OUTPUT MATCHES "^ok: ")
+    message(FATAL_ERROR "filter_matches with the embedded model: ${OUTPUT}")
+  endif()
+endif()
+
+file(GLOB ODOMETRY "${WORK}/find/odometry*")
+if(ODOMETRY)  # OpenCV has the modules for it
+  foreach(source orb flow)
+    run("${WORK}/find/odometry" "${SOURCE}/examples/images" 800,800,319.5,239.5 ${source} "${MODEL}")
+    if(NOT OUTPUT MATCHES "1 pairs: features and matching [0-9.]+ ms, filter [0-9.]+ ms per frame")
+      message(FATAL_ERROR "odometry ${source}: ${OUTPUT}")
+    endif()
+  endforeach()
 endif()
 
 # A version that is not there is refused.

@@ -3,6 +3,8 @@
 #include "check.hpp"
 #include "golden_files.hpp"
 
+#include <mgca/mgca.h>
+
 #include <atomic>
 #include <fstream>
 #include <iterator>
@@ -74,13 +76,42 @@ void model_files_are_checked(const std::filesystem::path& file) {
                               "early_end is missing");
     mgca::RuntimeOptions provider;
     provider.providers = {"NoSuchExecutionProvider"};
-    check::throws<mgca::Error>([&] { Model::from_file(file, provider); }, "provider");
+    provider.cpu_fallback = false;
+    check::throws<mgca::Error>([&] { Model::from_file(file, provider); }, "has no NoSuchExecutionProvider");
+    provider.cpu_fallback = true;
+    const Model given_way = Model::from_file(file, provider);
+    check::that(given_way.notes().size() == 1 &&
+                    given_way.notes()[0].find("another provider than asked for: this ONNX Runtime has no") !=
+                        std::string::npos,
+                "a provider that gives way is noted");
+    std::string renamed = content;
+    for (std::size_t at = 0; (at = renamed.find("correspondences", at)) != std::string::npos; ++at) {
+        renamed.replace(at, 15, "correspondencez");
+    }
+    check::throws<ModelError>([&] { Model::from_memory(renamed.data(), renamed.size()); }, "expected correspondences");
     // All of one family, which is also a std::runtime_error.
     check::throws<mgca::Error>([] { Model::from_file("no such file.onnx"); }, "not found");
     check::throws<std::runtime_error>([] { Model::from_file("no such file.onnx"); }, "not found");
 }
 
+/// SHA256SUMS beside a file, as sha256sum writes it.
+void sums_are_checked(const std::filesystem::path& file, const Model& model) {
+    const std::filesystem::path folder = std::filesystem::temp_directory_path() / "mgca_test_sums";
+    std::filesystem::create_directories(folder);
+    const std::filesystem::path copy = folder / "model.onnx";
+    std::filesystem::copy_file(file, copy, std::filesystem::copy_options::overwrite_existing);
+    const auto with_sum = [&](const std::string& line) {
+        std::ofstream(folder / "SHA256SUMS") << std::string(64, '0') << "  other.onnx\n" << line;
+        return Model::from_file(copy).sha256();
+    };
+    check::equal(with_sum(model.sha256() + "  model.onnx\n"), model.sha256(), "the sum that is listed");
+    check::equal(with_sum(""), model.sha256(), "a file that is not listed is not compared");
+    check::throws<ModelError>([&] { with_sum(std::string(64, '1') + "  model.onnx\n"); }, "damaged or replaced");
+    std::filesystem::remove_all(folder);
+}
+
 void models_are_named(const Model& model) {
+    check::that(model.notes().empty(), "nothing is noted where nothing was asked for");
     check::that(!model.name().empty() && !model.version().empty(), "name and version of the model");
     check::that(!Model::runtime().empty(), "name of the runtime");
     check::equal(std::string(MGCA_VERSION),
@@ -167,6 +198,10 @@ void options_are_felt(const Model& model, const MatchPair& pair) {
     const Result plain = answer([](Options&) {});
     check::that(plain.ok() && plain.num_network_matches > 0, "the pair goes through the network");
     check::that(same(plain, answer([](Options&) {})), "same options, same answer");
+    check::that(plain.num_accepted > 0 && plain.network_essential && plain.fitted_essential, "what the network said");
+    const cv::Vec4d moved = *plain.relative_pose(2.5) * cv::Vec4d(0.0, 0.0, 0.0, 1.0);
+    check::near(cv::norm(cv::Vec3d(moved[0], moved[1], moved[2]) - 2.5 * *plain.t), 0.0, 1e-12, "relative pose");
+    check::that(!Result().relative_pose(), "no pose, no matrix");
     check::that(answer([](Options& o) { o.threshold = 0.3; }).num_inliers < plain.num_inliers, "threshold is felt");
     check::that(answer([](Options& o) { o.keep_precision = 0.999; }).mask != plain.mask, "keep_precision is felt");
     // One estimator alone, whose answer no other outvotes.
@@ -248,6 +283,65 @@ void memory_and_file_agree(const std::filesystem::path& file, const Model& model
     check::that(same(from_memory(pair), Filter(model)(pair)), "a model in memory, on two threads, answers the same");
 }
 
+void embedded_model_is_the_file(const Model& model, const MatchPair& pair) {
+    check::equal(mgca::has_embedded_model(), MGCA_TEST_EMBEDDED != 0, "whether a model is embedded");
+    if (mgca::has_embedded_model()) {
+        check::that(same(Filter(mgca::embedded_model())(pair), Filter(model)(pair)), "the embedded model is the same");
+        check::equal(mgca::embedded_model().version(), model.version(), "version of the embedded model");
+        mgca::RuntimeOptions runtime;
+        runtime.threads = -1;
+        check::throws<ArgumentError>([&] { mgca::embedded_model(runtime); }, "threads");
+    } else {
+        check::throws<ModelError>([] { mgca::embedded_model(); }, "MGCA_EMBED_MODEL");
+    }
+}
+
+/// What mgca.h says of a pair is what filter.hpp says.
+void c_agrees(const std::filesystem::path& file, const Model& model, const MatchPair& pair) {
+    check::equal(static_cast<int>(Status::ok), static_cast<int>(MGCA_OK), "the first status");
+    check::equal(static_cast<int>(Status::suspicious_intrinsics), static_cast<int>(MGCA_SUSPICIOUS_INTRINSICS),
+                 "the last status");
+    const Result expected = Filter(model)(pair);
+    mgca_model* c_model = nullptr;
+    mgca_filter* c_filter = nullptr;
+    mgca_pair* c_pair = nullptr;
+    mgca_result* result = nullptr;
+    mgca_model_open(file.string().c_str(), 1, nullptr, &c_model);
+    mgca_filter_create(c_model, &c_filter);
+    mgca_pair_create(&c_pair);
+    int image = 0;
+    for (const Keypoints* keypoints : {&pair.keypoints1, &pair.keypoints2}) {
+        mgca_pair_set_keypoints(c_pair, ++image, &keypoints->points[0].x, keypoints->sizes.data(),
+                                keypoints->angles.data(), keypoints->points.size());
+        mgca_pair_set_camera(c_pair, image, pair.camera1.K->val, nullptr, 0, 0.0, 0.0);
+    }
+    std::vector<std::int32_t> indices;
+    for (std::size_t i = 0; i < pair.matches.index1.size(); ++i) {
+        indices.insert(indices.end(), {pair.matches.index1[i], pair.matches.index2[i]});
+    }
+    mgca_pair_set_matches(c_pair, indices.data(), pair.matches.distances.data(), pair.matches.second_distances.data(),
+                          pair.matches.index1.size());
+    check::equal(mgca_filter_run(c_filter, c_pair, &result), static_cast<int>(MGCA_DONE), "a pair through C");
+    const std::size_t count = mgca_result_size(result);
+    check::that(std::vector<unsigned char>(mgca_result_mask(result), mgca_result_mask(result) + count) == expected.mask,
+                "C: mask");
+    check::that(std::vector<float>(mgca_result_scores(result), mgca_result_scores(result) + count) == expected.scores,
+                "C: scores");
+    check::that(cv::Matx33d(mgca_result_matrix(result, "R")) == *expected.R, "C: R");
+    check::equal(mgca_result_number(result, "confidence"), expected.confidence.value_or(-1.0), "C: confidence");
+    mgca_result_free(result);
+    mgca_pair_free(c_pair);
+    mgca_filter_free(c_filter);
+    mgca_model_close(c_model);
+}
+
+void words_are_read() {
+    check::that(mgca::to_method("magsac") == mgca::Method::magsac, "method");
+    check::that(mgca::to_effort("full") == mgca::Effort::full, "effort");
+    check::that(mgca::to_geometry("homography") == mgca::Geometry::homography, "geometry");
+    check::throws<ArgumentError>([] { mgca::to_method("poselib"); }, "expected one of auto, prosac, magsac");
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -261,11 +355,15 @@ int main(int argc, char** argv) {
     options_are_checked(model);
     model_files_are_checked(file);
     models_are_named(model);
+    sums_are_checked(file, model);
     inputs_are_checked(model, golden::read_input(golden, "general"));
     data_never_throws(model);
     options_are_felt(model, pair);
     cameras_are_felt(model, pair);
     threads_share_a_filter(model, pair);
     memory_and_file_agree(file, model, pair);
+    embedded_model_is_the_file(model, pair);
+    c_agrees(file, model, pair);
+    words_are_read();
     return check::result("interface");
 }

@@ -12,6 +12,7 @@
 #include "json.hpp"
 #include "pose_refinement.hpp"
 #include "robust_fit.hpp"
+#include "sha256.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -52,6 +53,20 @@ Correspondences draw_wrong(int count, unsigned seed) {
 }
 
 const Pose kPose{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.2, 0.1))};
+
+/// The examples of FIPS 180-2, and lengths at which the padding takes a block of its own.
+void digests_are_those_of_the_standard() {
+    check::equal(mgca::detail::sha256(""),
+                 std::string("e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"), "sha256");
+    check::equal(mgca::detail::sha256("abc"),
+                 std::string("ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"), "sha256");
+    check::equal(mgca::detail::sha256("abcdbcdecdefdefgefghfghighijhijkijkljklmklmnlmnomnopnopq"),
+                 std::string("248d6a61d20638b8e5c026930c3e6039a33ce45964ff2167f6ecedd419db06c1"), "sha256");
+    check::equal(mgca::detail::sha256(std::string(64, 'a')),
+                 std::string("ffe054fe7ae0cb6dc65c3af9b61d5209f439851db43d0ba5997337df154668eb"), "a block");
+    check::equal(mgca::detail::sha256(std::string(200, 'a')),
+                 std::string("c2a908d98f5df987ade41b5fce213067efbcc21ef2240212a41e54b5e7c28ae5"), "blocks");
+}
 
 void json_is_read() {
     const Json value = Json::parse(R"( {"a": [1, -2.5e-3, 1e+2], "b": {"c": "x\u00e9\n\"", "d": null}, "e": true} )");
@@ -283,6 +298,7 @@ void guessed_and_seeded_estimators_answer() {
 }  // namespace
 
 int main() {
+    digests_are_those_of_the_standard();
     json_is_read();
     exact_matches_have_no_residual();
     refinement_finds_the_pose_and_never_raises_the_cost();

@@ -18,7 +18,6 @@
 #include <iostream>
 #include <limits>
 #include <locale>
-#include <map>
 #include <sstream>
 #include <stdexcept>
 #include <string>
@@ -29,8 +28,8 @@ namespace {
 constexpr int kFound = 0, kNothingFound = 1, kError = 2;
 
 constexpr const char* kHelp =
-    "usage: mgca_match IMAGE1 IMAGE2 --model FILE [options]\n"
-    "  --model FILE            ONNX file of mgca_filter\n"
+    "usage: mgca_match IMAGE1 IMAGE2 [--model FILE] [options]\n"
+    "  --model FILE            ONNX file of mgca_filter (default: the model within the library, where it has one)\n"
     "  --K, --K2 fx,fy,cx,cy   intrinsics in pixels; without --K2 both images share them, without both they are guessed\n"
     "  --dist, --dist2 k1,k2,p1,p2[,...]  distortion coefficients of OpenCV\n"
     "  --threshold PX          inlier threshold of the mask (default 1)\n"
@@ -93,19 +92,7 @@ cv::Matx33d intrinsics(const std::string& text, const std::string& option) {
     return {k[0], 0.0, k[2], 0.0, k[1], k[3], 0.0, 0.0, 1.0};
 }
 
-template <typename Value>
-Value word(const std::string& text, const std::string& option, const std::map<std::string, Value>& words) {
-    const auto known = words.find(text);
-    if (known == words.end()) {
-        throw std::invalid_argument(option + ": unknown: '" + text + "'");
-    }
-    return known->second;
-}
-
 void set_option(Arguments& arguments, const std::string& name, const std::string& value) {
-    using mgca::Effort;
-    using mgca::Geometry;
-    using mgca::Method;
     if (name == "--model") {
         arguments.model = value;
     } else if (name == "--K") {
@@ -131,21 +118,11 @@ void set_option(Arguments& arguments, const std::string& name, const std::string
     } else if (name == "--threads") {
         arguments.runtime.threads = integer(value, name);
     } else if (name == "--method") {
-        arguments.options.method = word<Method>(value, name,
-                                                {{"auto", Method::automatic},
-                                                 {"prosac", Method::prosac},
-                                                 {"magsac", Method::magsac},
-                                                 {"ransac", Method::ransac},
-                                                 {"none", Method::none}});
+        arguments.options.method = mgca::to_method(value);
     } else if (name == "--effort") {
-        arguments.options.effort =
-            word<Effort>(value, name, {{"auto", Effort::automatic}, {"full", Effort::full}});
+        arguments.options.effort = mgca::to_effort(value);
     } else if (name == "--geometry") {
-        arguments.options.geometry = word<Geometry>(value, name,
-                                                    {{"auto", Geometry::automatic},
-                                                     {"essential", Geometry::essential},
-                                                     {"fundamental", Geometry::fundamental},
-                                                     {"homography", Geometry::homography}});
+        arguments.options.geometry = mgca::to_geometry(value);
     } else {
         throw std::invalid_argument(name + ": unknown");
     }
@@ -168,8 +145,8 @@ Arguments parse_arguments(const std::vector<std::string>& words) {
     if (arguments.images.size() != 2) {
         throw std::invalid_argument("expected two images");
     }
-    if (arguments.model.empty()) {
-        throw std::invalid_argument("expected --model");
+    if (arguments.model.empty() && !mgca::has_embedded_model()) {
+        throw std::invalid_argument("expected --model: the library was built without a model in it");
     }
     return arguments;
 }
@@ -270,7 +247,9 @@ void print_words(std::ostream& out, const mgca::Result& result, double milliseco
 }
 
 int run(Arguments arguments) {
-    const mgca::Filter filter(mgca::Model::from_file(arguments.model, arguments.runtime), arguments.options);
+    const mgca::Model model = arguments.model.empty() ? mgca::embedded_model(arguments.runtime)
+                                                      : mgca::Model::from_file(arguments.model, arguments.runtime);
+    const mgca::Filter filter(model, arguments.options);
     std::vector<cv::KeyPoint> keypoints1, keypoints2;
     const cv::Mat descriptors1 =
         detect(arguments.images[0], arguments.max_keypoints, keypoints1, arguments.camera1.size);

@@ -5,7 +5,8 @@
 #include <iostream>
 
 int main(int argc, char** argv) {
-    const mgca::Filter filter(mgca::Model::from_file(argc > 1 ? argv[1] : "mgca_small.onnx"));
+    // Without a file: the model within the library, where it was built with one.
+    const mgca::Filter filter(argc > 1 ? mgca::Model::from_file(argv[1]) : mgca::embedded_model());
 
     // In a program of one's own these come from a detector and a matcher.
     std::vector<cv::Point2f> points1, points2;

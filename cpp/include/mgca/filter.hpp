@@ -1,6 +1,6 @@
 // Tells right feature matches from wrong ones and estimates the two-view geometry.
 //
-//     const mgca::Filter filter(mgca::Model::from_file("mgca_small.onnx"));
+//     const mgca::Filter filter(mgca::embedded_model());  // or mgca::Model::from_file("mgca_small.onnx")
 //     const mgca::Result result = filter(keypoints1, keypoints2, knn_matches, K);
 //     if (result.ok()) use(*result.R, *result.t);
 //
@@ -82,8 +82,17 @@ enum class Effort { automatic, full };
 /// the model; homography fits one and no more.
 enum class Geometry { automatic, essential, fundamental, homography };
 
+/// The values for words of the Python package: "auto", "prosac", "magsac", "ransac", "none"; "auto", "full"; "auto",
+/// "essential", "fundamental", "homography". Another word throws ArgumentError.
+MGCA_API Method to_method(const std::string& word);
+MGCA_API Effort to_effort(const std::string& word);
+MGCA_API Geometry to_geometry(const std::string& word);
+
 /// Where the intrinsics of an answer come from.
 enum class IntrinsicsSource { given, estimated, guessed };
+
+/// The word for it: "given", "estimated" or "guessed".
+MGCA_API const char* to_string(IntrinsicsSource source) noexcept;
 
 /// Settings of the filter.
 struct Options {
@@ -100,9 +109,11 @@ struct Options {
 /// Settings of the inference runtime.
 struct RuntimeOptions {
     int threads = 1;  ///< Threads of one forward pass; 0 = as many as there are cores.
-    /// Execution providers of ONNX Runtime, the preferred first ("CUDAExecutionProvider"); none = CPU. One that cannot
-    /// start is an error. Must be empty where the library was built on cv::dnn.
+    /// Execution providers of ONNX Runtime, the preferred first ("CUDAExecutionProvider"); none = CPU. Must be empty where
+    /// the library was built on cv::dnn.
     std::vector<std::string> providers;
+    /// One that is missing or cannot start gives way to the CPU, which Model::notes tells; otherwise it is a RuntimeError.
+    bool cpu_fallback = true;
     /// Options of a provider by its name, as ONNX Runtime names them.
     std::map<std::string, std::map<std::string, std::string>> provider_options;
 };
@@ -110,7 +121,8 @@ struct RuntimeOptions {
 /// An open model file. Cheap to copy: copies share one session. Safe to use from several threads.
 class MGCA_API Model {
 public:
-    /// Open an ONNX file of mgca_filter. Throws ModelError or RuntimeError.
+    /// Open an ONNX file of mgca_filter. Throws ModelError, also where the SHA256SUMS beside it lists another file of this
+    /// name, or RuntimeError.
     static Model from_file(const std::filesystem::path& file, const RuntimeOptions& options = {});
 
     /// The same from bytes, which need not outlive the call.
@@ -122,6 +134,12 @@ public:
     /// Version of the model, as its file says.
     const std::string& version() const noexcept;
 
+    /// SHA-256 of the model file, hexadecimal.
+    const std::string& sha256() const noexcept;
+
+    /// Sentences on what turned out otherwise than asked for: another provider.
+    const std::vector<std::string>& notes() const noexcept;
+
     /// Name and version of the inference runtime.
     static std::string runtime();
 
@@ -129,9 +147,16 @@ public:
 
 private:
     friend class Filter;
+    friend MGCA_API Model embedded_model(const RuntimeOptions& options);
     explicit Model(std::shared_ptr<const State> state) : state_(std::move(state)) {}
     std::shared_ptr<const State> state_;
 };
+
+/// The library was built with a model in it (MGCA_EMBED_MODEL).
+MGCA_API bool has_embedded_model() noexcept;
+
+/// Open the model that is within the library; throws ModelError where it was built without one, or RuntimeError.
+MGCA_API Model embedded_model(const RuntimeOptions& options = {});
 
 /// Keypoints of one image; converts from what OpenCV programs hold.
 struct MGCA_API Keypoints {
@@ -218,6 +243,9 @@ struct Result {
     std::optional<double> focal_px;             ///< Estimated focal length, pixels, and its relative standard deviation.
     std::optional<double> focal_sigma;
     std::vector<std::string> assumptions;       ///< Sentences on what was assumed.
+    int num_accepted = 0;                       ///< Matches whose logit is above the model's decision threshold.
+    std::optional<cv::Matx33d> network_essential;  ///< Essential matrix as the network gave it.
+    std::optional<cv::Matx33d> fitted_essential;   ///< As the robust fit left it, before the verdict.
     int num_network_matches = 0;                ///< Matches that entered the network; 0 where it was not needed.
     std::string origin;                         ///< Source that proposed the model: "list", "network", "accepted", ...
     std::string ended;                          ///< "before the network", "first sources" or "all sources".
@@ -225,6 +253,22 @@ struct Result {
     std::optional<double> log10_false_alarms;   ///< How many models chance would support as well.
     std::optional<double> translation_sigma_deg;  ///< Standard deviation of the direction of translation.
     std::optional<double> focal_factor;         ///< The matches ask for focal lengths this many times those given.
+
+    /// The pose of camera 2 relative to camera 1, X2 = T X1 in homogeneous coordinates; nothing without R or t. Two views
+    /// do not tell the baseline, the distance of the cameras: it is 1 unless the caller knows better.
+    std::optional<cv::Matx44d> relative_pose(double baseline = 1.0) const {
+        if (!R || !t) {
+            return std::nullopt;
+        }
+        cv::Matx44d T = cv::Matx44d::eye();
+        for (int row = 0; row < 3; ++row) {
+            for (int column = 0; column < 3; ++column) {
+                T(row, column) = (*R)(row, column);
+            }
+            T(row, 3) = baseline * (*t)[row];
+        }
+        return T;
+    }
 
     /// The geometry may be used as it is.
     bool ok() const noexcept { return status == Status::ok || status == Status::planar; }
