@@ -1,8 +1,9 @@
 """Every command and every snippet of the pages runs, in the order of the page, in a folder of its own.
 
 ``bash`` and ``python`` blocks are run; the Python blocks of a page share their names. The folder holds ``examples``, as
-a checkout does. A block below a paragraph that begins with "Not run by the tests:" is only checked for options that its
-commands do not have, and so are commands within the text and within blocks of no language.
+a checkout does. Lines of a ``text`` block are found in what the block before it prints, but for the figures. A block
+below a paragraph that begins with "Not run by the tests:" is only checked for options that its commands do not have, and
+so are commands within the text and within blocks of no language.
 """
 
 from __future__ import annotations
@@ -34,8 +35,7 @@ NOT_RUN = "Not run by the tests:"
 LARGEST_NOT_RUN = 12
 """Blocks of all pages that are not run: few."""
 NEEDS = {
-    "how_to/no_calibration.md": ["joblib"],
-    "how_to/orb_robot.md": [],
+    "how_to/no_calibration.md": ["joblib", "pycolmap"],
     "pipelines/colmap.md": ["pycolmap", "joblib"],
     "pipelines/folder.md": ["pycolmap", "joblib"],
     "pipelines/hloc.md": ["h5py", "joblib"],
@@ -71,7 +71,12 @@ def read_blocks(page: str) -> list[Block]:
 
 
 def runnable(page: str) -> list[Block]:
-    return [block for block in read_blocks(page) if block.language in ("bash", "python") and block.run]
+    return [block for block in read_blocks(page) if block.language in ("bash", "python", "text") and block.run]
+
+
+def without_figures(line: str) -> str:
+    """A line with its numbers and spaces alike, for times and last digits differ."""
+    return re.sub(r"\s+", " ", re.sub(r"[+-]?\d+(\.\d*)?(e[+-]?\d+)?", "0", line)).strip()
 
 
 @pytest.fixture
@@ -83,11 +88,20 @@ def workshop(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def run_bash(text: str, folder: Path) -> None:
+def run_bash(text: str, folder: Path) -> str:
+    """What the commands print, on both streams."""
     ray = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
     environment = {**os.environ, "PYTHONPATH": str(ROOT), **ray}
     done = subprocess.run(["bash", "-c", PREAMBLE + text], cwd=folder, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, f"{text}\n{done.stdout}\n{done.stderr}"
+    return done.stdout + done.stderr
+
+
+def run_python(text: str, name: str, names: dict[str, object]) -> str:
+    """What the code prints; ``names`` are those of the page so far."""
+    with contextlib.redirect_stdout(io.StringIO()) as output:
+        exec(compile(text, name, "exec"), names)
+    return output.getvalue()
 
 
 def run_page(page: str, folder: Path) -> None:
@@ -95,11 +109,15 @@ def run_page(page: str, folder: Path) -> None:
     for package in NEEDS.get(page, ()):
         pytest.importorskip(package)
     names: dict[str, object] = {"__name__": "__main__"}
+    printed = ""
     for number, block in enumerate(runnable(page), 1):
         if block.language == "bash":
-            run_bash(block.text, folder)
+            printed = run_bash(block.text, folder)
+        elif block.language == "python":
+            printed = run_python(block.text, f"{page}, block {number}", names)
         else:
-            exec(compile(block.text, f"{page}, block {number}", "exec"), names)
+            lines = {without_figures(line) for line in printed.splitlines()}
+            assert {without_figures(line) for line in block.text.splitlines()} <= lines, printed
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if runnable(page) and page not in SLOW])
