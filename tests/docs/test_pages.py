@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import importlib.util
 import io
 import json
 import os
@@ -19,13 +20,18 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import matplotlib
 import numpy as np
 import pytest
 
 import mgca_filter
+from conftest import make_scene
 from mgca_filter import Status
+from mgca_filter.cli import main
+from mgca_filter.pipelines import folder
+from scene_bundles import bundle_fields, learned_fields
 
 matplotlib.use("Agg")
 ROOT = Path(__file__).parents[2]
@@ -42,7 +48,14 @@ NEEDS = {
     "pipelines/ray.md": ["ray"],
 }
 """Packages that a page needs beyond the runtime's."""
-SLOW = {"evaluation.md", "pipelines/colmap.md", "pipelines/folder.md", "pipelines/hloc.md", "pipelines/ray.md", "training.md"}
+SLOW = {
+    "how_to/no_calibration.md",
+    "pipelines/colmap.md",
+    "pipelines/folder.md",
+    "pipelines/hloc.md",
+    "pipelines/ray.md",
+    "training.md",
+}
 # The package and the interpreter from here, under the names that users type.
 PREAMBLE = f"""set -euo pipefail
 python() {{ "{sys.executable}" "$@"; }}
@@ -132,6 +145,12 @@ def test_blocks_of_the_long_page(page, workshop):
     run_page(page, workshop)
 
 
+def test_no_block_hides_in_a_list():
+    """Indented fences are not found, and would not be run."""
+    hidden = [page for page in PAGES if re.search(r"^ +```", (DOCS / page).read_text(encoding="utf-8"), re.M)]
+    assert hidden == []
+
+
 def test_few_blocks_are_not_run():
     left_out = [page for page in PAGES for block in read_blocks(page) if not block.run]
     assert 1 <= len(left_out) <= LARGEST_NOT_RUN, left_out
@@ -143,7 +162,9 @@ def commands(page: str) -> list[list[str]]:
     for block in runnable(page):
         text = text.replace(block.text, "")
     text = re.sub(r"\\\n\s*", "", text)
-    found = re.findall(r"`((?:python -m (?:mgca_filter|benchmarks)\b|mgca-match)[^`]*)`", re.sub(r"\n(?=\S)", " ", text))
+    found = re.findall(
+        r"`((?:python -m (?:mgca_filter|benchmarks)\b|mgca-match)[^`]*)`", re.sub(r"\n(?=\S)", " ", text)
+    )
     found += re.findall(r"^.*?((?:python -m (?:mgca_filter|benchmarks)\b|mgca-match ).*)$", text, re.M)
     return [shlex.split(re.sub(r"`.*", "", line), comments=True) for line in found if line.count('"') % 2 == 0]
 
@@ -155,15 +176,16 @@ def help_of(words: list[str]) -> str:
     else:
         module, rest = "mgca_filter", words[1:]
     if module == "mgca_filter":
-        main = importlib.import_module("mgca_filter.cli").main
+        command = main
         rest = [word for word in rest[:1] if word in ("colmap", "hloc", "folder", "run")]
     else:
         package = importlib.util.find_spec(module)
         assert package is not None, f"there is no {module}"
         name = f"{module}.__main__" if package.submodule_search_locations else module
-        main, rest = importlib.import_module(name).main, []
-    with contextlib.redirect_stdout(io.StringIO()) as output, contextlib.suppress(SystemExit):
-        main([*rest, "--help"])
+        command, rest = importlib.import_module(name).main, []
+    arguments = mock.patch.object(sys, "argv", ["command", *rest, "--help"])  # some read it themselves
+    with arguments, contextlib.redirect_stdout(io.StringIO()) as output, contextlib.suppress(SystemExit):
+        command()
     return output.getvalue()
 
 
@@ -195,9 +217,22 @@ def described(section: str) -> set[str]:
 
 
 def test_the_page_on_files_describes_what_is_written(workshop):
-    pair = "examples/images/left.jpg examples/images/right.jpg --K 820,820,511.5,383.5 --compare"
-    run_bash(f"mgca-match {pair} --json pair.json --npz pair.npz -q", workshop)
+    pair = ["examples/images/left.jpg", "examples/images/right.jpg", "--K", "820,820,511.5,383.5"]
+    assert main([*pair, "--compare", "--max-keypoints", "1500", "--json", "pair.json", "--npz", "pair.npz", "-q"]) == 0
     document = json.loads((workshop / "pair.json").read_text())
     assert described("JSON of a pair") >= set(document) | set(document["kept"]) | set(document["comparison"][0])
     with np.load(workshop / "pair.npz") as arrays:
         assert described("NPZ of a pair") >= set(arrays.files)
+
+
+def test_the_page_on_files_describes_json_lines():
+    keys = re.findall(r"``(\w+)``", folder.write_json_lines.__doc__ or "")
+    assert "points1" in keys
+    assert described("JSON lines of a folder") >= set(keys)
+
+
+def test_the_page_on_bundles_describes_every_array(tmp_path):
+    text = (DOCS / "reference" / "bundle.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| ([^|]+) \|", text, re.M))))
+    scenes = [make_scene()]
+    assert named == set(bundle_fields(scenes)) | {name for name in learned_fields(scenes)} | {"match_label"}

@@ -1,0 +1,116 @@
+"""The documentation builds without a warning and without network, and its notebooks run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("sphinx")
+pytest.importorskip("myst_nb")
+pytest.importorskip("furo")
+nbformat = pytest.importorskip("nbformat")
+nbclient = pytest.importorskip("nbclient")
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+NOTEBOOKS = {"first_steps": 4, "reconstruction": 3}
+"""Pictures that each notebook must show."""
+# No address outside this machine is reached: whoever tries is answered by nobody.
+NO_NETWORK = {name: "http://127.0.0.1:9" for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY")}
+ENVIRONMENT = {**os.environ, **NO_NETWORK, "PYTHONPATH": str(ROOT)}
+
+
+def build(target: Path, *options: str) -> Path:
+    """The site, built with warnings as errors."""
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-E", *options, str(DOCS), str(target)]
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=target.parent)
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    """The site without the notebooks' answers."""
+    return build(tmp_path_factory.mktemp("docs") / "site", "-D", "nb_execution_mode=off")
+
+
+def test_every_page_is_there_and_every_command_has_its_options(site):
+    pages = {path.relative_to(DOCS).with_suffix("") for path in DOCS.rglob("*.md")}
+    assert [page for page in pages if not (site / page).with_suffix(".html").is_file()] == []
+    commands = (site / "reference" / "command_line.html").read_text(encoding="utf-8")
+    for option in ("--keep-precision P", "--in-place", "--engine {local,ray}", "--run-dir", "--time-matched NAME"):
+        assert option in commands
+    api = (site / "reference" / "api.html").read_text(encoding="utf-8")
+    assert 'id="mgca_filter.filter_matches"' in api
+    assert "a homography beside or instead of it" in api
+
+
+def test_the_log_is_outside_the_navigation(site):
+    start = (site / "index.html").read_text(encoding="utf-8")
+    (sidebar,) = re.findall(r'<div class="sidebar-tree">.*?</aside>', start, re.S)
+    assert "how_to/no_calibration.html" in sidebar
+    assert "training_log.html" not in sidebar
+    assert (site / "training_log.html").is_file()
+
+
+def test_links_within_the_site_lead_somewhere(site):
+    for page in site.rglob("*.html"):
+        for link in re.findall(r'(?:href|src)="([^"#?]+)[^"]*"', page.read_text(encoding="utf-8")):
+            if not re.match(r"[a-z]+:", link):
+                assert (page.parent / link).exists(), f"{page.relative_to(site)}: {link}"
+
+
+def test_pages_load_nothing_from_elsewhere(site):
+    for page in site.rglob("*.html"):
+        loaded = re.findall(r'<(?:script|img|iframe)[^>]* src="(https?:[^"]+)"', page.read_text(encoding="utf-8"))
+        assert loaded == [], page.name
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebooks_are_stored_without_answers(name):
+    notebook = json.loads((DOCS / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))
+    code = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert len(code) > 4
+    assert [cell for cell in code if cell["outputs"] or cell["execution_count"] is not None] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_notebooks_run_and_show_pictures(name, monkeypatch):
+    if name == "reconstruction":
+        pytest.importorskip("pycolmap")
+        pytest.importorskip("joblib")
+    for variable, value in ENVIRONMENT.items():
+        monkeypatch.setenv(variable, value)
+    notebook = nbformat.read(DOCS / "notebooks" / f"{name}.ipynb", as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": DOCS}}
+    )
+    client.execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    pictures = [output for output in outputs if "image/png" in output.get("data", {})]
+    assert len(pictures) >= NOTEBOOKS[name]
+    printed = "".join(output["text"] for output in outputs if output["output_type"] == "stream")
+    if name == "first_steps":
+        errors = [float(error) for error in re.findall(r"pose is ([\d.]+) degrees off", printed)]
+        assert errors[1] < 1 < errors[0]
+    else:
+        assert "8 of 8 images registered" in printed
+        assert float(re.findall(r"off by ([\d.]+) cm", printed)[0]) < 20
+
+
+@pytest.mark.slow
+def test_the_site_shows_what_the_notebooks_answer(tmp_path):
+    pytest.importorskip("pycolmap")
+    site = build(tmp_path / "site")
+    for name, count in NOTEBOOKS.items():
+        page = (site / "notebooks" / f"{name}.html").read_text(encoding="utf-8")
+        pictures = re.findall(r'<img[^>]* src="(\.\./_images/[^"]+)"', page)
+        assert len(pictures) >= count
+        assert all((site / "notebooks" / picture).is_file() for picture in pictures)
