@@ -2,8 +2,8 @@
 
 ``bash`` and ``python`` blocks are run; the Python blocks of a page share their names. The folder holds ``examples``, as
 a checkout does. Lines of a ``text`` block are found in what the block before it prints, but for the figures. A block
-below a paragraph that begins with "Not run by the tests:" is only checked for options that its commands do not have, and
-so are commands within the text and within blocks of no language.
+below a paragraph that begins with "Not run by the tests:" is only checked for options that its commands do not have,
+and so are commands within the text and within blocks of no language.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from unittest import mock
 import matplotlib
 import numpy as np
 import pytest
+from conftest import make_scene
+from scene_bundles import bundle_fields, learned_fields
 
 import mgca_filter
-from conftest import make_scene
 from mgca_filter import Status
 from mgca_filter.cli import main
 from mgca_filter.pipelines import folder
-from scene_bundles import bundle_fields, learned_fields
 
 matplotlib.use("Agg")
 ROOT = Path(__file__).parents[2]
@@ -235,4 +235,4 @@ def test_the_page_on_bundles_describes_every_array(tmp_path):
     text = (DOCS / "reference" / "bundle.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`(\w+)`", " ".join(re.findall(r"^\| ([^|]+) \|", text, re.M))))
     scenes = [make_scene()]
-    assert named == set(bundle_fields(scenes)) | {name for name in learned_fields(scenes)} | {"match_label"}
+    assert named == set(bundle_fields(scenes)) | set(learned_fields(scenes)) | {"match_label"}

@@ -22,7 +22,7 @@ DOCS = ROOT / "docs"
 NOTEBOOKS = {"first_steps": 4, "reconstruction": 3}
 """Pictures that each notebook must show."""
 # No address outside this machine is reached: whoever tries is answered by nobody.
-NO_NETWORK = {name: "http://127.0.0.1:9" for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY")}
+NO_NETWORK = dict.fromkeys(("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"), "http://127.0.0.1:9")
 ENVIRONMENT = {**os.environ, **NO_NETWORK, "PYTHONPATH": str(ROOT)}
 
 
