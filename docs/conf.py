@@ -30,13 +30,16 @@ exclude_patterns = ["_build", "extensions", "demo", "**/.ipynb_checkpoints"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 templates_path: list[str] = []
 
+smartquotes = False
+pygments_style = "friendly"
+pygments_dark_style = "github-dark"
+
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
-nb_execution_in_temp = False
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"
