@@ -30,7 +30,7 @@ exclude_patterns = ["_build", "extensions", "demo", "**/.ipynb_checkpoints"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 templates_path: list[str] = []
 
-smartquotes = False
+smartquotes_action = "De"  # dashes and ellipses; quotation marks are code's
 pygments_style = "friendly"
 pygments_dark_style = "github-dark"
 
@@ -43,9 +43,7 @@ nb_execution_timeout = 300
 nb_merge_streams = True
 
 autodoc_member_order = "bysource"
-autodoc_typehints = "signature"
-autodoc_preserve_defaults = True
-autodoc_type_aliases = {name: name for name in ("PointsLike", "MatchesLike", "MatrixLike", "SizeLike", "Providers")}
+autodoc_typehints = "none"
 python_maximum_signature_line_length = 100
 napoleon_numpy_docstring = False
 napoleon_use_ivar = True

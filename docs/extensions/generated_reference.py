@@ -1,10 +1,12 @@
-"""Pages from the code itself: commands from argparse, statuses from their texts, and the example pair's report.
+"""Pages from the code itself: commands from argparse, statuses from their texts, signatures as they are written.
+
+The report of the example pair is made with them.
 
 ::
 
-    ```{command} mgca_filter.cli.pair
+    ```{command} mgca_filter.cli
     ```
-    ```{command} mgca_filter.cli.pipelines colmap
+    ```{command} mgca_filter.cli colmap
     ```
     ```{statuses}
     ```
@@ -14,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import inspect
 import re
 from pathlib import Path
 from typing import Any
@@ -29,10 +32,10 @@ class _Reached(Exception):
 
 
 def parser_of(module: str, subcommand: str = "") -> argparse.ArgumentParser:
-    """The parser with which ``main`` of a module reads its arguments.
+    """The parser with which ``main`` of a module reads its arguments, or those after the name of a subcommand.
 
     Raises:
-        LookupError: ``main`` reads none, or there is no such subcommand.
+        LookupError: ``main`` reads none.
     """
 
     def stop(parser: argparse.ArgumentParser, *_: Any) -> None:
@@ -41,23 +44,21 @@ def parser_of(module: str, subcommand: str = "") -> argparse.ArgumentParser:
     names = ("parse_args", "parse_known_args")
     with mock.patch.multiple(argparse.ArgumentParser, **dict.fromkeys(names, stop)):
         try:
-            importlib.import_module(module).main([])
+            importlib.import_module(module).main([subcommand] if subcommand else [])
         except _Reached as reached:
-            parser = reached.args[0]
+            parser: argparse.ArgumentParser = reached.args[0]
         else:
-            raise LookupError(f"{module}: main reads no arguments")
-    if not subcommand:
-        return parser
+            raise LookupError(f"{module} {subcommand}: main reads no arguments")
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction) and subcommand in action.choices:
             return action.choices[subcommand]
-    raise LookupError(f"{module}: no subcommand {subcommand}")
+    return parser
 
 
 def _words(text: str) -> list[nodes.Node]:
-    """Plain text with ``literals``."""
-    parts = re.split(r"``(.+?)``", " ".join(text.split()))
-    return [nodes.literal(text=part) if i % 2 else nodes.Text(part) for i, part in enumerate(parts) if part]
+    """Plain text with ``literals``; options are literals in any case."""
+    parts = re.split(r"(``.+?``|(?<!\S)--[a-z][\w-]*)", " ".join(text.split()))
+    return [nodes.literal(text=part.strip("`")) if i % 2 else nodes.Text(part) for i, part in enumerate(parts) if part]
 
 
 def _paragraphs(text: str | None) -> list[nodes.Node]:
@@ -93,7 +94,12 @@ class Command(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         parser = parser_of(*self.arguments)
         usage = parser.format_usage().removeprefix("usage: ").rstrip()
-        usage = re.sub(r"^\S*__main__\.py|^sphinx-build|^\S*pytest\S*", f"python -m {self.arguments[0]}", usage)
+        module = self.arguments[0].removesuffix(".__main__")
+        usage = re.sub(r"^\S*__main__\.py|^sphinx-build|^\S*pytest\S*", f"python -m {module}", usage)
+            r"^\S*__main__\.py|^sphinx-build|^\S*pytest\S*",
+            f"python -m {self.arguments[0].removesuffix('.__main__')}",
+            usage,
+        )
         found: list[nodes.Node] = [*_paragraphs(parser.description), nodes.literal_block(usage, usage, language="text")]
         formatter = parser._get_formatter()
         for group in parser._action_groups:
@@ -146,8 +152,39 @@ def write_example_report(app: Sphinx) -> None:
         raise RuntimeError("no geometry in the example pair")
 
 
+def written_signature(
+    app: Sphinx, what: str, name: str, obj: Any, options: Any, signature: str | None, returns: str | None
+) -> tuple[str, str | None] | None:
+    """Signatures with the annotations as the source has them: ``MatchesLike`` rather than all that it stands for."""
+    if what not in ("function", "method", "class") or signature is None:
+        return None
+    written = inspect.signature(obj)
+    words, starred = [], False
+    for index, parameter in enumerate(written.parameters.values()):
+        if what == "method" and index == 0:
+            continue
+        if parameter.kind is parameter.VAR_POSITIONAL or (parameter.kind is parameter.KEYWORD_ONLY and not starred):
+            starred = True
+            if parameter.kind is parameter.KEYWORD_ONLY:
+                words.append("*")
+        word = {parameter.VAR_POSITIONAL: "*", parameter.VAR_KEYWORD: "**"}.get(parameter.kind, "") + parameter.name
+        if parameter.annotation is not parameter.empty:
+            word += f": {_written(parameter.annotation)}"
+        if parameter.default is not parameter.empty:
+            default = repr(parameter.default)
+            word += f" = {'...' if default.startswith('<') else default}"
+        words.append(word)
+    answer = None if written.return_annotation in (written.empty, None, "None") else _written(written.return_annotation)
+    return f"({', '.join(words)})", None if what == "class" else answer
+
+
+def _written(annotation: Any) -> str:
+    return annotation if isinstance(annotation, str) else getattr(annotation, "__name__", str(annotation))
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     app.add_directive("command", Command)
     app.add_directive("statuses", Statuses)
     app.connect("builder-inited", write_example_report)
+    app.connect("autodoc-process-signature", written_signature)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

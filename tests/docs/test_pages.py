@@ -177,7 +177,7 @@ def help_of(words: list[str]) -> str:
         module, rest = "mgca_filter", words[1:]
     if module == "mgca_filter":
         command = main
-        rest = [word for word in rest[:1] if word in ("colmap", "hloc", "folder", "run")]
+        rest = [word for word in rest[:1] if word in ("colmap", "hloc", "folder", "run", "train", "evaluate")]
     else:
         package = importlib.util.find_spec(module)
         assert package is not None, f"there is no {module}"
@@ -210,13 +210,13 @@ def test_the_status_page_tells_what_each_status_gives():
 
 def described(section: str) -> set[str]:
     """Names in the first column of the tables of a section of the page on files."""
-    text = (DOCS / "reference" / "files.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference" / "command-line-output.md").read_text(encoding="utf-8")
     body = re.split(r"^## ", text.split(f"## {section}\n", 1)[1], maxsplit=1, flags=re.M)[0]
     cells = re.findall(r"^\| ([^|]+) \|", body, re.M)
     return {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
 
 
-def test_the_page_on_files_describes_what_is_written(workshop):
+def test_the_page_on_output_describes_what_is_written(workshop):
     pair = ["examples/images/left.jpg", "examples/images/right.jpg", "--K", "820,820,511.5,383.5"]
     assert main([*pair, "--compare", "--max-keypoints", "1500", "--json", "pair.json", "--npz", "pair.npz", "-q"]) == 0
     document = json.loads((workshop / "pair.json").read_text())
@@ -225,7 +225,7 @@ def test_the_page_on_files_describes_what_is_written(workshop):
         assert described("NPZ of a pair") >= set(arrays.files)
 
 
-def test_the_page_on_files_describes_json_lines():
+def test_the_page_on_output_describes_json_lines():
     keys = re.findall(r"``(\w+)``", folder.write_json_lines.__doc__ or "")
     assert "points1" in keys
     assert described("JSON lines of a folder") >= set(keys)
