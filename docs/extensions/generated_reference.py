@@ -96,10 +96,6 @@ class Command(SphinxDirective):
         usage = parser.format_usage().removeprefix("usage: ").rstrip()
         module = self.arguments[0].removesuffix(".__main__")
         usage = re.sub(r"^\S*__main__\.py|^sphinx-build|^\S*pytest\S*", f"python -m {module}", usage)
-            r"^\S*__main__\.py|^sphinx-build|^\S*pytest\S*",
-            f"python -m {self.arguments[0].removesuffix('.__main__')}",
-            usage,
-        )
         found: list[nodes.Node] = [*_paragraphs(parser.description), nodes.literal_block(usage, usage, language="text")]
         formatter = parser._get_formatter()
         for group in parser._action_groups:
