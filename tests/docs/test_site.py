@@ -40,6 +40,7 @@ def site(tmp_path_factory) -> Path:
     return build(tmp_path_factory.mktemp("docs") / "site", "-D", "nb_execution_mode=off")
 
 
+@pytest.mark.slow
 def test_every_page_is_there_and_every_command_has_its_options(site):
     pages = {path.relative_to(DOCS).with_suffix("") for path in DOCS.rglob("*.md")}
     assert [page for page in pages if not (site / page).with_suffix(".html").is_file()] == []
@@ -51,6 +52,7 @@ def test_every_page_is_there_and_every_command_has_its_options(site):
     assert "a homography beside or instead of it" in " ".join(api.split())
 
 
+@pytest.mark.slow
 def test_the_log_is_outside_the_navigation(site):
     start = (site / "index.html").read_text(encoding="utf-8")
     (sidebar,) = re.findall(r'<div class="sidebar-tree">.*?</aside>', start, re.S)
@@ -59,6 +61,7 @@ def test_the_log_is_outside_the_navigation(site):
     assert (site / "training_log.html").is_file()
 
 
+@pytest.mark.slow
 def test_links_within_the_site_lead_somewhere(site):
     for page in site.rglob("*.html"):
         for link in re.findall(r'(?:href|src)="([^"#?]+)[^"]*"', page.read_text(encoding="utf-8")):
@@ -66,6 +69,7 @@ def test_links_within_the_site_lead_somewhere(site):
                 assert (page.parent / link).exists(), f"{page.relative_to(site)}: {link}"
 
 
+@pytest.mark.slow
 def test_pages_load_nothing_from_elsewhere(site):
     for page in site.rglob("*.html"):
         loaded = re.findall(r'<(?:script|img|iframe)[^>]* src="(https?:[^"]+)"', page.read_text(encoding="utf-8"))
