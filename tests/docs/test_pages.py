@@ -39,6 +39,7 @@ NOT_RUN = "Not run by the tests:"
 LARGEST_NOT_RUN = 12
 """Blocks of all pages that are not run: few."""
 NEEDS = {
+    "evaluation.md": ["matplotlib"],
     "how_to/no_calibration.md": ["joblib", "pycolmap"],
     "pipelines/colmap.md": ["pycolmap", "joblib"],
     "pipelines/folder.md": ["pycolmap", "joblib"],
@@ -47,6 +48,7 @@ NEEDS = {
 }
 """Packages that a page needs beyond the runtime's."""
 SLOW = {
+    "evaluation.md",
     "how_to/no_calibration.md",
     "pipelines/colmap.md",
     "pipelines/folder.md",
@@ -137,6 +139,7 @@ def test_blocks_of_the_page(page, workshop):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("page", sorted(SLOW))
 def test_blocks_of_the_long_page(page, workshop):
     assert runnable(page)

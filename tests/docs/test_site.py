@@ -85,6 +85,7 @@ def test_notebooks_are_stored_without_answers(name):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_notebooks_run_and_show_pictures(name, monkeypatch):
     if name == "reconstruction":
@@ -110,6 +111,7 @@ def test_notebooks_run_and_show_pictures(name, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_the_site_shows_what_the_notebooks_answer(tmp_path):
     pytest.importorskip("pycolmap")
     site = build(tmp_path / "site")
