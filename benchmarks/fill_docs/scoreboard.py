@@ -1,4 +1,4 @@
-"""Put the scoreboard into README, its page, model card and figures: ``python -m benchmarks.fill_docs.scoreboard FILE``.
+"""Put the scoreboard into README, model card and figures: ``python -m benchmarks.fill_docs.scoreboard FILE``.
 
 ``FILE`` comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures need matplotlib;
 those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best baseline and
@@ -23,7 +23,6 @@ from .pages import fill_file
 
 ROOT = Path(__file__).resolve().parents[2]
 README, MODEL_CARD = "README.md", "mgca_filter/models/mgca_small.md"
-PAGE = "docs/reference/scoreboard.md"
 FIGURES = "docs/figures"
 EXAMPLE = "examples/images/courtyard.txt"
 COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms")
@@ -115,7 +114,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error
     fill_file(options.root / README, places)
-    fill_file(options.root / PAGE, places)
     fill_file(options.root / MODEL_CARD, {**places, "difficulty": difficulty(summary)})
     pictured = dict.fromkeys([BASELINE_ROWS[0], best_baseline(summary.rows, "product"), "product"])
     rows = [parse_method(name) for name in pictured]

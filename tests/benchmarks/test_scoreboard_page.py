@@ -83,16 +83,14 @@ def test_tables_and_figures_are_written(tmp_path: Path):
     pytest.importorskip("matplotlib")
     (tmp_path / "mgca_filter" / "models").mkdir(parents=True)
     board = "above\n<!-- scoreboard -->\nstale table\n<!-- /scoreboard -->\nbelow\n"
-    for page in (scoreboard.README, scoreboard.PAGE):
-        (tmp_path / page).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / page).write_text(board)
+    (tmp_path / scoreboard.README).write_text(board)
     (tmp_path / scoreboard.MODEL_CARD).write_text(f"<!-- difficulty -->\nstale figures\n<!-- /difficulty -->\n{board}")
     (tmp_path / "board.json").write_text(json.dumps(SUMMARY.to_json()))
     scoreboard.main([str(tmp_path / "board.json"), "--root", str(tmp_path)])
     card = (tmp_path / scoreboard.MODEL_CARD).read_text()
     assert "| baseline angle below 5° | 2 | 50.0 | 60.0 | 20.0 |\n<!-- /difficulty -->" in card
     assert "stale figures" not in card
-    for text in ((tmp_path / scoreboard.README).read_text(), (tmp_path / scoreboard.PAGE).read_text(), card):
+    for text in ((tmp_path / scoreboard.README).read_text(), card):
         assert "above\n<!-- scoreboard -->\n" in text
         assert text.endswith("below\n")
         assert "stale table" not in text
