@@ -1,6 +1,6 @@
 """Renders the courtyard of the example pair from many places: images and their exact poses, as a COLMAP model.
 
-    python examples/render_views.py [--out views] [--count 8] [--supersampling 2]
+    python examples/render_views.py [--out views] [--count 8] [--supersampling 2] [--slow 1]
 
 writes ``images/view00.png`` …, and ``truth/`` with ``cameras.txt``, ``images.txt`` and an empty ``points3D.txt``.
 """
@@ -32,16 +32,20 @@ class View:
     t: np.ndarray
 
 
-def render_views(count: int = 8, supersampling: int = 2) -> list[View]:
-    """Views from an arc, so far apart that four of five nearest-neighbour matches are wrong."""
+def render_views(count: int = 8, supersampling: int = 2, slow: float = 1.0) -> list[View]:
+    """Views from an arc, so far apart that four of five nearest-neighbour matches are wrong.
+
+    With ``slow`` above 1 the camera moves and turns by that much less from view to view, as in a video.
+    """
     faces, views = courtyard(), []
-    for k, a in enumerate(np.linspace(-1.0, 1.0, count)):
+    for index, a in enumerate(np.linspace(-1.0, 2.0 / slow - 1.0, count)):
+        k = index / slow
         position = (5.2 * a, -0.5 + 0.4 * np.sin(3 * k), 1.6 * a * a - 1.2 + 0.8 * np.cos(2.1 * k))
         camera = look_at(position, (0.3 * np.sin(k), -0.3, 7.5), 15 * np.sin(1.7 * k), FOCAL_PX, SIZE)
         gains = 0.9 + 0.15 * np.sin([k, 2 * k, 3 * k])
         image = render(faces, camera, supersampling)
-        image = expose(image, gains, 1.0 + 0.25 * np.cos(k), 0.7 + 0.3 * (k % 3), 0.05, seed=k)
-        views.append(View(f"view{k:02d}.png", image, camera.K, camera.R, camera.t))
+        image = expose(image, gains, 1.0 + 0.25 * np.cos(k), 0.7 + 0.3 * (k % 3), 0.05, seed=index)
+        views.append(View(f"view{index:02d}.png", image, camera.K, camera.R, camera.t))
     return views
 
 
@@ -72,8 +76,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("views"))
     parser.add_argument("--count", type=int, default=8)
     parser.add_argument("--supersampling", type=int, default=2, help="rays per pixel and direction (default 2)")
+    parser.add_argument("--slow", type=float, default=1.0, help="motion is this many times smaller (default 1)")
     options = parser.parse_args()
-    views = render_views(options.count, options.supersampling)
+    views = render_views(options.count, options.supersampling, options.slow)
     (options.out / "images").mkdir(parents=True, exist_ok=True)
     for view in views:
         cv2.imwrite(str(options.out / "images" / view.name), view.image)

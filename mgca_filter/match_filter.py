@@ -72,8 +72,8 @@ class MatchFilter:
     Thread-safe; picklable, with the session reopened on the other side.
 
     Args:
-        threshold, keep_precision, confidence, method, effort, geometry, max_iterations, model, providers, backend,
-            seed: as in :func:`filter_matches`.
+        threshold, keep_precision, confidence, method, effort, geometry: as in :func:`filter_matches`.
+        max_iterations, model, providers, backend, seed: likewise.
 
     Raises:
         TypeError, ValueError: an option is not one of the above.

@@ -92,7 +92,7 @@ class MatchReport:
     @property
     def found_geometry(self) -> bool:
         """A model explains the pair; with ``method="none"`` nothing was fitted and there is none."""
-        fitted = self.result.F is not None or self.result.R is not None
+        fitted = any(model is not None for model in (self.result.F, self.result.R, self.result.H))
         return fitted and self.result.status in _EXPLAINED
 
 
