@@ -32,7 +32,7 @@ FLOORS = (
     ("network", "drawing", "exif", "images", "tables", "verdict_text"),
     ("geometry",),
     ("types", "atomic_file"),
-    ("errors",),
+    ("errors", "opencv_version"),
 )
 HEIGHT = {room: -index for index, floor in enumerate(FLOORS) for room in floor}
 
