@@ -47,7 +47,7 @@ def main() -> None:
         {"method": "magsac"},
         {"method": "prosac"},
         {"geometry": "fundamental"},
-        {"keep_precision": 0.9},
+        {"keep_precision": 0.6},
     ):
         result = mgca_filter.filter_matches(kp1, kp2, matches, K1=K, **options)
         assert result.ok, (options, result)

@@ -29,8 +29,8 @@ FLOORS = (
     ("inputs",),
     ("html_report",),
     ("result",),
-    ("network", "drawing", "exif", "images", "tables", "verdict_text"),
-    ("geometry",),
+    ("network", "drawing", "images", "tables", "verdict_text"),
+    ("exif", "geometry", "image_header"),
     ("types", "atomic_file"),
     ("errors", "opencv_version"),
 )

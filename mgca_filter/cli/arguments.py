@@ -99,7 +99,11 @@ def filter_options(options: argparse.Namespace) -> dict[str, Any]:
 
 def quiet_codecs() -> None:
     """Keep OpenCV's log of what is wrong with an image off stderr: the command says so itself, in one line."""
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    logging = getattr(cv2.utils, "logging", None)
+    if logging is not None:
+        logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    else:  # OpenCV 4.10 has it elsewhere
+        getattr(cv2, "setLogLevel")(0)  # noqa: B009  # which newer stubs do not know
 
 
 def intrinsics(text: str) -> NDArray[np.float64]:

@@ -46,8 +46,8 @@ _USAGE = """\
 _EPILOG = """\
 "mgca-match colmap --help", and so on, tells of the other commands.
 
-Pixels are those of the image as it is shown: a photo that its EXIF says to turn is turned first, and --K is for the
-turned one. (mgca-match folder, like COLMAP and hloc, takes photos as they are stored.)
+Pixels are those of the image as it is shown: a photo that its EXIF says to turn is turned first. --K is for the photo
+as it is shown or as it is stored, whichever its principal point is the middle of.
 
 exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
 1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""

@@ -31,8 +31,10 @@ _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
 written. A killed run goes on where it stopped when the same command is given again."""
 _FOLDER_EPILOG = """\
-Pixels are those of the file as it is stored: like COLMAP and hloc, and unlike "mgca-match img1 img2", this command does
-not turn photos as their EXIF says, and --K is for the photo as it is stored.
+Photos are matched as their EXIF says that they are to be shown, as by "mgca-match img1 img2". OUT.jsonl is in those
+pixels. COLMAP and hloc read files as they are stored: in OUT.db and OUT.h5 keypoints, cameras and geometry are turned
+back to the pixels of the files. --K is for the photos as they are shown or as they are stored: of one camera held
+upright and sideways, one K fits all photos.
 
 """
 # What every command needs, and its own extra brings; and the extras that bring other packages.

@@ -37,10 +37,10 @@ def test_the_usage_names_every_command(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_help_says_whether_photos_are_turned(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, expected in (([], "turned first"), (["folder"], "does\nnot turn photos as their EXIF says")):
+    for words, expected in (([], "turned first"), (["folder"], "turned\nback to the pixels of the files")):
         text = help_of(capsys, *words)
         assert expected in text
-        assert "--K is for the" in text
+        assert "--K is for the photo" in text
 
 
 def test_run_is_a_word_of_the_command_as_well(tmp_path: Path) -> None:
