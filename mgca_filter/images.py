@@ -21,6 +21,8 @@ MAX_PIXELS_VARIABLE = "OPENCV_IO_MAX_IMAGE_PIXELS"
 
 # Values that lie beyond are clipped: hot and dead pixels would take up the range.
 _STRETCHED_SHARE = (0.001, 0.999)
+# Of the longer side of an image: shorter focal lengths are those of a fisheye at the very least.
+_SHORTEST_FOCAL_SHARE = 0.1
 # A principal point is near the middle of its image; these shares of its sides are far off.
 _MIDDLE = (0.25, 0.75)
 
@@ -100,6 +102,16 @@ def principal_point_doubt(K: NDArray[np.float64], size: tuple[int, int]) -> str 
     if _MIDDLE[0] <= x <= _MIDDLE[1] and _MIDDLE[0] <= y <= _MIDDLE[1]:
         return None
     return f"the principal point {K[0, 2]:g},{K[1, 2]:g} is far from the middle of an image of {size[0]} x {size[1]}"
+
+
+def intrinsics_unit_doubt(K: NDArray[np.float64], size: tuple[int, int]) -> str | None:
+    """A sentence where the focal length of ``K`` (3, 3) is hardly one in pixels of an image of (width, height)."""
+    if K[0, 0] >= _SHORTEST_FOCAL_SHARE * max(size):
+        return None
+    return (
+        f"a focal length of {K[0, 0]:g} px is that of no lens for an image of {size[0]} x {size[1]}; K is in pixels, "
+        "not in millimetres or shares of the image"
+    )
 
 
 def size_of_intrinsics(K: NDArray[np.float64], photos: Iterable[tuple[tuple[int, int], int]]) -> tuple[int, int] | None:
