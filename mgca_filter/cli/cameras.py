@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -191,7 +192,7 @@ def read_text(path: Path) -> str:
     data = path.read_bytes()
     encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
-        text = data.decode(encoding)
+        text = data.decode(encoding).lstrip("\ufeff")
     except UnicodeDecodeError:
         raise ValueError("not a text file" + _BINARY_HINT * path.name.startswith("cameras")) from None
     if "\0" in text:
@@ -362,7 +363,7 @@ def _numpy_cameras(path: Path, source: str) -> dict[str, Camera]:
         with loaded as archive:
             known = {*_K_NAMES, *_COMMON_D_NAMES, "D1", "D2", "distCoeffs1", "distCoeffs2"}
             values = {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files if name in known}
-    except (ValueError, TypeError, EOFError) as error:
+    except (ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"cannot be read as numpy's arrays ({' '.join(str(error).split())})") from None
     return _named_cameras(values, None, source, fisheye=False)
 
