@@ -16,6 +16,8 @@ from .image_header import promised_size
 
 MAX_PIXELS = 2**28
 """Of a file that is decoded, unless the environment says otherwise: 16384 x 16384, more than any camera takes."""
+MAX_FILE_BYTES = 2**31
+"""Of an image file; :data:`MAX_PIXELS` take 3 bytes each where nothing is compressed, 6 of 16 bits."""
 MAX_PIXELS_VARIABLE = "OPENCV_IO_MAX_IMAGE_PIXELS"
 """OpenCV's own limit, which it reads once, when it is loaded, and which is 2^30 by default."""
 

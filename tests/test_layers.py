@@ -30,7 +30,7 @@ FLOORS = (
     ("html_report",),
     ("result",),
     ("network", "drawing", "images", "tables", "verdict_text"),
-    ("exif", "geometry", "image_header"),
+    ("exif", "geometry", "image_header", "input_file"),
     ("types", "atomic_file"),
     ("errors", "opencv_version"),
 )

@@ -3,8 +3,8 @@
 The whole of it stands once, in ``docs/reference/scoreboard.md``; README and model card get six rows of it, the README a
 plot of eight. ``FILE`` comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures
 need matplotlib; those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best
-baseline and plain RANSAC keep of the example pair: right matches green, wrong ones red. The model card also gets the figures by
-scene and by difficulty, beside those of the strongest baselines.
+baseline and plain RANSAC keep of the example pair: right matches green, wrong ones red. The model card also gets the
+figures by scene and by difficulty, beside those of the strongest baselines.
 """
 
 from __future__ import annotations

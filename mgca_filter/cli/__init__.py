@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -17,6 +18,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status (0 = geometry found, 1 = none, 2 = usage)."""
     # ONNX Runtime reports its use to its makers, and complains where it cannot; a filter has no business to.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # names of files need not fit its encoding
+            stream.reconfigure(errors="backslashreplace")
     words = sys.argv[1:] if arguments is None else list(arguments)
     first = words[0] if words else ""
     if first in PIPELINES and not Path(first).is_file():

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from ..geometry.cameras import Distortion, Fisheye
 from ..geometry.orientation import is_quarter_turn, shown_camera, shown_size
 from ..images import intrinsics_as_shown, size_of_intrinsics
+from ..input_file import read_text
 
 Array = NDArray[np.float64]
 
@@ -183,25 +184,6 @@ def _as_distortion(values: Any, fisheye: bool) -> Distortion | None:
     return coefficients if coefficients.any() else None
 
 
-def read_text(path: Path) -> str:
-    """A text file of any system: byte-order marks and line ends as they come.
-
-    Raises:
-        OSError: it cannot be read. ValueError: it is no text.
-    """
-    data = path.read_bytes()
-    encoding = "utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
-    try:
-        text = data.decode(encoding).lstrip("\ufeff")
-    except UnicodeDecodeError:
-        raise ValueError("not a text file" + _BINARY_HINT * path.name.startswith("cameras")) from None
-    if "\0" in text:
-        raise ValueError("not a text file" + _BINARY_HINT * path.name.startswith("cameras"))
-    if not text.strip():
-        raise ValueError("the file is empty")
-    return text
-
-
 _BINARY_HINT = "; `colmap model_converter --output_type TXT` writes one"
 
 
@@ -215,7 +197,10 @@ def _from_file(text: str) -> CameraArgument:
     if path.suffix in (".npy", ".npz"):
         cameras = _numpy_cameras(path, text)
     else:
-        content = read_text(path)
+        try:
+            content = read_text(path)
+        except ValueError as error:
+            raise ValueError(f"{error}{_BINARY_HINT if path.suffix == '.bin' else ''}") from None
         if _is_storage(path, content):
             cameras = _storage_cameras(content, text)
         elif any(line.split()[1:2] and line.split()[1] in COLMAP_NAMES for line in content.splitlines()):

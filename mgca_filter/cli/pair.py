@@ -7,7 +7,8 @@ import logging
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,12 +22,14 @@ from ..exif import exif_intrinsics
 from ..features import detector_resolution
 from ..geometry.cameras import Distortion
 from ..images import (
+    MAX_FILE_BYTES,
     decode_photo,
     intrinsics_as_shown,
     intrinsics_unit_doubt,
     principal_point_doubt,
     size_of_intrinsics,
 )
+from ..input_file import read_bytes
 from ..match_images import match_images
 from ..result import Status
 from .arguments import (
@@ -142,7 +145,7 @@ def read_photo(path: Path) -> Photo:
         UsageError: the file cannot be read or decoded; the message names it.
     """
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, MAX_FILE_BYTES)
         image, orientation = decode_photo(data)
         return Photo(path, image, orientation, exif_intrinsics(data, (image.shape[1], image.shape[0])))
     except OSError as error:
@@ -154,6 +157,10 @@ def read_photo(path: Path) -> Photo:
 def _check_outputs(options: argparse.Namespace) -> None:
     """Complain about output paths before the work rather than after it."""
     json_path = None if options.json in (None, "-") else Path(options.json)
+    outputs = [path for path in (options.output, json_path, options.npz, options.html) if path is not None]
+    for path in outputs:
+        if sum(other.resolve() == path.resolve() for other in outputs) > 1:
+            raise UsageError(f"{path}: is asked for twice")
     for path in (options.output, json_path, options.npz, options.html):
         if path is not None and (path.is_dir() or not path.parent.is_dir()):
             raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
@@ -289,13 +296,25 @@ def _write(report: MatchReport, options: argparse.Namespace, command: str) -> No
     if json_alone:
         print(to_json(report))
     elif options.json:
-        Path(options.json).write_text(to_json(report) + "\n", encoding="utf-8")
+        with _named(options.json):
+            Path(options.json).write_text(to_json(report) + "\n", encoding="utf-8")
     if options.npz:
-        write_npz(options.npz, report)
+        with _named(options.npz):
+            write_npz(options.npz, report)
     if options.html:
-        write_html(options.html, report, command)
+        with _named(options.html):
+            write_html(options.html, report, command)
     if options.output and not cv2.imwrite(str(options.output), picture(report)):
         raise UsageError(f"{options.output}: cannot be written")
+
+
+@contextmanager
+def _named(path: Path | str) -> Iterator[None]:
+    """What the system says of writing a file, with its name, which it leaves out where the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from error
 
 
 def _log_to_stderr(level: int) -> None:

@@ -24,6 +24,8 @@ from .truth import TruePose
 
 _EXPLAINED = (Status.OK, Status.PLANAR, Status.PURE_ROTATION, Status.SUSPICIOUS_INTRINSICS)
 # Only these come with a pose that can be used as it is.
+# Relative standard deviation from which on an estimated focal length is none.
+_POOR_SIGMA = 0.3
 _USABLE = (Status.OK, Status.PLANAR)
 
 
@@ -166,7 +168,7 @@ def _focal_lines(report: MatchReport) -> list[str]:
     how_to = "--K fx,fy,cx,cy or --K FILE (K.txt, cameras.txt, OpenCV's YAML)"
     if report.intrinsics == "estimated":
         sigma = info["focal_sigma"]
-        accuracy = f", good to about {100.0 * sigma:.0f} %" if np.isfinite(sigma) else ""
+        accuracy = f", good to about {100.0 * sigma:.0f} %" if sigma < _POOR_SIGMA else ", which hardly tell it"
         found = f"focal length {info['focal_px']:.0f} px estimated from the matches{accuracy}"
         return [f"{found}: {how_to} makes the pose surer"]
     if report.intrinsics != "guessed":

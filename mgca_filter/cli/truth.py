@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from ..geometry.epipolar import essential_from_pose, rotation_error_deg, sampson_distance, translation_error_deg
 from ..geometry.orientation import shown_camera
-from .cameras import colmap_images, match_name, read_text
+from ..input_file import read_text
+from .cameras import colmap_images, match_name
 
 Array = NDArray[np.float64]
 RIGHT_PX = 3.0

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from ..features import ImageFeatures, detector_resolution
+from ..images import MAX_FILE_BYTES
+from ..input_file import read_bytes
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
 
@@ -93,8 +95,8 @@ class FeatureCache:
 
 
 def _bytes_or_none(path: Path) -> bytes:
-    """The file, empty where it cannot be read: one bad image does not stop the others."""
+    """The file, empty where it cannot be read or is too long: one bad image does not stop the others."""
     try:
-        return path.read_bytes()
-    except OSError:
+        return read_bytes(path, MAX_FILE_BYTES)
+    except (OSError, ValueError):
         return b""

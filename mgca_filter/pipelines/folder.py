@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..features import DEFAULT_DETECTOR, DEFAULT_FEATURE_COUNT, ImageFeatures
 from ..images import intrinsics_as_shown, principal_point_doubt, size_of_intrinsics
+from ..input_file import read_text
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
 from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
@@ -61,21 +63,29 @@ def read_pairs(path: Path, names: Sequence[str], folder: Path) -> list[tuple[str
         PipelineError: the file cannot be read, a line has not two names, or names an image that ``names`` lacks.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PipelineError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from error
-    known, pairs = set(names), dict[frozenset[str], tuple[str, str]]()
+        lines = read_text(path, may_be_empty=True).splitlines()
+    except (OSError, ValueError) as error:
+        raise PipelineError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    # A name as another system writes it: with its separators, from "./" on, or its accents apart.
+    known = {_plain(name): name for name in names} | {name: name for name in names}
+    pairs = dict[frozenset[str], tuple[str, str]]()
     for number, line in enumerate(lines, 1):
         words = [word.strip() for word in line.split("\t")] if "\t" in line else line.split()
         if not words or words[0].startswith("#"):
             continue
-        if len(words) != 2 or words[0] == words[1]:
+        found = [known.get(word) or known.get(_plain(word)) for word in words]
+        if len(words) != 2 or words[0] == words[1] or (found[0] == found[1] and None not in found):
             raise PipelineError(f"{path}:{number}: expected two names of images, got {line.strip()!r}")
-        for word in words:
-            if word not in known:
+        for word, name in zip(words, found):
+            if name is None:
                 raise PipelineError(f"{path}:{number}: {word} is not in {folder}")
+        words = [name for name in found if name is not None]
         pairs.setdefault(frozenset(words), (words[0], words[1]))
     return list(pairs.values())
+
+
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name.replace("\\", "/").removeprefix("./"))
 
 
 @dataclass(frozen=True)

@@ -302,6 +302,8 @@ def test_wrong_intrinsics(capsys, words):
         ([LEFT, RIGHT, "-o", LEFT], ["left.jpg", "is one of the images"]),
         ([LEFT, RIGHT, "--npz", RIGHT], ["right.jpg", "is one of the images"]),
         ([LEFT, RIGHT, "--json", str(IMAGES)], [str(IMAGES)]),
+        ([LEFT, RIGHT, "--json", "x.out", "--npz", "./x.out"], ["x.out", "twice"]),
+        ([LEFT, "/dev/null"], ["/dev/null", "empty"]),
         ([LEFT, RIGHT, "--npz", "no/such/folder/m.npz"], ["no/such/folder/m.npz"]),
     ],
 )
@@ -445,3 +447,31 @@ def test_version_and_help(capsys):
             cli.main([option])
         assert stopped.value.code == 0
         assert words in capsys.readouterr().out
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full")
+@pytest.mark.parametrize("option", ["--json", "--npz", "--html"])
+def test_a_full_disk_is_told_with_the_file(unrelated, model_file, capsys, tmp_path, option):
+    """By a link to the device, so that no fault of ours can replace the device itself."""
+    (tmp_path / "full").symlink_to("/dev/full")
+    path = str(tmp_path / "full")
+    words = [unrelated, unrelated, "--model", str(model_file), "--max-keypoints", "150", "-q", option, path]
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == f"mgca-match: {path}: No space left on device\n"
+
+
+def test_an_image_that_never_ends_is_not_read_to_its_end(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("mgca_filter.cli.pair.MAX_FILE_BYTES", 2_000_000)
+    assert_usage_error(capsys, [LEFT, "/dev/zero"], "/dev/zero", "longer than")
+    (tmp_path / "sparse.png").touch()
+    os.truncate(tmp_path / "sparse.png", 2**40)
+    assert_usage_error(capsys, [LEFT, str(tmp_path / "sparse.png")], "sparse.png", "longer than")
+
+
+def test_names_that_the_terminal_cannot_show_are_shown_all_the_same(tmp_path, model_file, unrelated):
+    path = tmp_path / "b\u00fcro.png"
+    path.write_bytes(Path(unrelated).read_bytes())
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "mgca_filter", str(path), str(path), "--model", str(model_file)]
+    done = subprocess.run([*command, "--max-keypoints", "150"], capture_output=True, text=True, env=environment)
+    assert "b\\xfcro.png: 160 x 120" in done.stdout, done.stderr

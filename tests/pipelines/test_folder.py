@@ -26,7 +26,8 @@ from mgca_filter.features import create_detector, describe
 from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 from mgca_filter.html_report import write_folder_report
 from mgca_filter.images import intrinsics_as_shown
-from mgca_filter.pipelines.folder import FolderJob, camera_size, exhaustive_pairs, sequential_pairs
+from mgca_filter.pipelines.folder import FolderJob, camera_size, exhaustive_pairs, read_pairs, sequential_pairs
+from mgca_filter.pipelines.journal import PipelineError
 from mgca_filter.pipelines.stored_pixels import stored_row
 from mgca_filter.pipelines.worker import PairRow
 
@@ -533,3 +534,15 @@ def test_a_mirrored_file_has_no_rotation_to_its_neighbour():
         assert stored_row(row, *shapes).t is None
     np.testing.assert_array_equal(stored_row(row, mirrored, mirrored).R, np.eye(3))
     np.testing.assert_array_equal(stored_row(row, mirrored, mirrored).t, [-1, 0, 0])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_pair_lists_as_other_systems_write_them(tmp_path, encoding):
+    """Encodings and line ends; separators; names from "./" on; accents apart, as macOS writes them."""
+    names = ["b\u00fcro/a.png", "b.png", "c.png"]
+    lines = ["bu\u0308ro\\a.png b.png", "./c.png ./b.png", "b.png c.png", ""]
+    (tmp_path / "pairs.txt").write_bytes("\r\n".join(lines).encode(encoding))
+    assert read_pairs(tmp_path / "pairs.txt", names, tmp_path) == [(names[0], "b.png"), ("c.png", "b.png")]
+    (tmp_path / "pairs.txt").write_text("b.png ./b.png\n")
+    with pytest.raises(PipelineError, match="expected two names"):
+        read_pairs(tmp_path / "pairs.txt", names, tmp_path)
