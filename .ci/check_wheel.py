@@ -17,6 +17,7 @@ LIMIT_BYTES = 10_000_000
 NEEDED = (
     *("mgca_filter/py.typed", "mgca_filter/fit/choice.json", "mgca_filter/models/SHA256SUMS"),
     *("mgca_filter/models/mgca_small.onnx", "mgca_filter/models/mgca_small.md"),
+    *("mgca_filter/models/mgca_fast.onnx", "mgca_filter/models/mgca_fast.md"),
     *("mgca_filter/html_report/page.html", "mgca_filter/html_report/style.css", "mgca_filter/html_report/viewer.js"),
     *("mgca_filter/training/configs/small.toml", "licenses/LICENSE", "licenses/LICENSE-WEIGHTS.md"),
 )
