@@ -5,6 +5,7 @@ best of them and re-tests every match against it. Importing the package loads ne
 Matplotlib; ONNX Runtime is loaded when the first model is opened.
 """
 
+from . import opencv_version  # noqa: F401  # before all that needs OpenCV
 from .errors import BackendError, BundleError, MgcaFilterError, ModelError
 from .geometry.cameras import Fisheye
 from .inputs.attributes import MatchAttributes

@@ -21,6 +21,8 @@ HEADER_PX = 46
 _KEPT: Colour = (84, 214, 92)
 _REJECTED: Colour = (82, 76, 196)
 _BACKGROUND: Colour = (30, 26, 24)
+RIGHT_AND_WRONG: tuple[Colour, Colour] = ((233, 180, 86), (0, 94, 213))
+"""Sky blue and vermilion, which all eyes tell apart (Okabe & Ito, "Color Universal Design", 2008)."""
 _TITLE: Colour = (245, 245, 245)
 _TEXT: Colour = (196, 192, 188)
 _IMAGE_BRIGHTNESS = 0.72  # lines must stand out against a bright photograph
@@ -38,6 +40,7 @@ class MatchPanel:
         facts: short phrases that follow in the header, such as "2000 matches".
         success: colours the mark in front of the title, green or red.
         words: what the legend calls the two colours.
+        colours: of the two kinds of matches, both in plain sight; by default the rejected ones are muted.
     """
 
     mask: NDArray[np.bool_]
@@ -45,6 +48,7 @@ class MatchPanel:
     facts: Sequence[str] = ()
     success: bool = True
     words: tuple[str, str] = ("kept", "rejected")
+    colours: tuple[Colour, Colour] | None = None
 
 
 def draw_matches(image1: Image, image2: Image, points1: ArrayLike, points2: ArrayLike, panel: MatchPanel) -> Image:
@@ -69,9 +73,11 @@ def draw_matches(image1: Image, image2: Image, points1: ArrayLike, points2: Arra
     if len(rejected) > MAX_REJECTED_DRAWN:
         rejected = rejected[np.linspace(0, len(rejected) - 1, MAX_REJECTED_DRAWN).astype(int)]
     kept = np.flatnonzero(mask & drawable)
-    canvas = _draw_lines(canvas, start[rejected], end[rejected], _REJECTED, _opacity(len(rejected), 0.32, 0.45))
-    canvas = _draw_lines(canvas, start[kept], end[kept], _KEPT, _opacity(len(kept), 0.65, 0.85))
-    _draw_ends(canvas, np.vstack([start[kept], end[kept]]), _KEPT)
+    good, bad = panel.colours or (_KEPT, _REJECTED)
+    highest = 0.45 if panel.colours is None else 0.85
+    canvas = _draw_lines(canvas, start[rejected], end[rejected], bad, _opacity(len(rejected), 0.32, highest))
+    canvas = _draw_lines(canvas, start[kept], end[kept], good, _opacity(len(kept), 0.65, 0.85))
+    _draw_ends(canvas, np.vstack([start[kept], end[kept]]), good)
     return np.vstack([_header(canvas.shape[1], panel), canvas])
 
 
@@ -83,6 +89,15 @@ def draw_before_after(
     below = draw_matches(image1, image2, points1, points2, after)
     rule = np.full((GAP_PX, above.shape[1], 3), 255, np.uint8)
     return np.vstack([above, rule, below])
+
+
+def caption(width: int, words: str) -> Image:
+    """A strip (h, width, 3) uint8 BGR with words, to stand above or below a picture."""
+    strip = np.full((HEADER_PX, width, 3), _BACKGROUND, np.uint8)
+    text = _text(words, _TEXT)
+    room = min(text.shape[1], max(0, width - 20))
+    strip[:, 20 : 20 + room] = text[:, :room]
+    return strip
 
 
 @dataclass(frozen=True)
@@ -179,15 +194,15 @@ def _header(width: int, panel: MatchPanel) -> Image:
         strip[top : top + shrunk.shape[0], 20 : 20 + room] = shrunk
         return strip
     strip[:, 20 : 20 + left] = row
-    legend = _legend(panel.words)
+    legend = _legend(panel.words, panel.colours or (_KEPT, _REJECTED))
     if left + legend.shape[1] + gap <= room:
         strip[:, width - legend.shape[1] :] = legend
     return strip
 
 
-def _legend(words: tuple[str, str]) -> Image:
+def _legend(words: tuple[str, str], colours: tuple[Colour, Colour]) -> Image:
     pieces = []
-    for word, colour in zip(words, (_KEPT, _REJECTED)):
+    for word, colour in zip(words, colours):
         swatch = np.full((HEADER_PX, 36, 3), _BACKGROUND, np.uint8)
         cv2.line(swatch, (4, HEADER_PX // 2), (26, HEADER_PX // 2), colour, 2, cv2.LINE_AA)
         pieces += [swatch, _text(word, _TEXT), np.full((HEADER_PX, 18, 3), _BACKGROUND, np.uint8)]

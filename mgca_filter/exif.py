@@ -1,17 +1,19 @@
-"""EXIF of photographs: the focal length that the camera wrote into the file.
+"""EXIF of photographs: the focal length that the camera wrote into the file, and how it was held.
 
 Tags as in "Exchangeable image file format for digital still cameras: Exif Version 2.32" (CIPA DC-008), in a TIFF
-directory: the file itself, or the APP1 segment of a JPEG.
+directory: the file itself, the APP1 segment of a JPEG, or the chunk of a PNG or WebP.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 _EXIF_DIRECTORY = 0x8769
+_ORIENTATION = 0x0112
 _FOCAL_LENGTH, _FOCAL_LENGTH_35MM = 0x920A, 0xA405
 _PIXEL_X, _PIXEL_Y = 0xA002, 0xA003
 _FOCAL_PLANE_X_RESOLUTION, _FOCAL_PLANE_UNIT = 0xA20E, 0xA210
@@ -31,7 +33,7 @@ def exif_intrinsics(data: bytes, size: tuple[int, int]) -> NDArray[np.float64] |
     tag, from the focal length in millimetres and the resolution of the sensor.
 
     Args:
-        data: bytes of a JPEG or TIFF file; anything else gives None, and nothing raises.
+        data: bytes of a JPEG, TIFF, PNG or WebP file; anything else gives None, and nothing raises.
         size: (width, height) of the image that K is for, pixels: upright or as stored, whole or resized.
     """
     focal = _focal_length(_read_tags(data), max(size))
@@ -39,6 +41,16 @@ def exif_intrinsics(data: bytes, size: tuple[int, int]) -> NDArray[np.float64] |
         return None
     width, height = size
     return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+def exif_orientation(data: bytes) -> int:
+    """How a photograph is to be shown, 1 (as it is stored) to 8; 1 where the file says nothing, and nothing raises.
+
+    Args:
+        data: bytes of a JPEG, TIFF, PNG or WebP file, or of any other.
+    """
+    orientation = _read_tags(data).get(_ORIENTATION, 1.0)
+    return int(orientation) if orientation in range(1, 9) else 1
 
 
 def _focal_length(tags: dict[int, float], side: int) -> float | None:
@@ -66,7 +78,12 @@ def _read_tags(data: bytes) -> dict[int, float]:
 
 
 def _tiff_part(data: bytes) -> bytes:
-    """The TIFF in a JPEG's EXIF segment; any other file as it is."""
+    """The TIFF in a JPEG's EXIF segment, or in a PNG's or WebP's EXIF chunk; any other file as it is."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return _chunk(data, 8, ">I4s", b"eXIf", lambda length: 12 + length)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        exif = _chunk(data, 12, "<4sI", b"EXIF", lambda length: 8 + length + length % 2)
+        return exif[6:] if exif[:6] == b"Exif\0\0" else exif
     if data[:2] != b"\xff\xd8":
         return data
     at = 2
@@ -78,6 +95,17 @@ def _tiff_part(data: bytes) -> bytes:
         if data[at + 1] == 0xE1 and data[at + 4 : at + 10] == b"Exif\0\0":
             return data[at + 10 : at + 2 + length]
         at += 2 + length
+    return b""
+
+
+def _chunk(data: bytes, at: int, head: str, wanted: bytes, step: Callable[[int], int]) -> bytes:
+    """Content of the first chunk of a name; ``step`` from one chunk's start to the next by its length."""
+    while at + 8 <= len(data):
+        words = struct.unpack_from(head, data, at)
+        name, length = (words[1], words[0]) if head[0] == ">" else words
+        if name == wanted:
+            return data[at + 8 : at + 8 + length]
+        at += step(length)
     return b""
 
 

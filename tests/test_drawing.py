@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mgca_filter import drawing
-from mgca_filter.drawing import MatchPanel, draw_before_after, draw_matches
+from mgca_filter.drawing import RIGHT_AND_WRONG, MatchPanel, caption, draw_before_after, draw_matches
 
 
 def grey_image(width: int, height: int) -> np.ndarray:
@@ -107,6 +107,20 @@ def test_long_header_fits_a_narrow_picture():
     image = grey_image(40, 300)
     words = MatchPanel(np.zeros(0, bool), "a title", ["a rather long fact about the matches"] * 9)
     assert draw_matches(image, image, [], [], words).shape[2] == 3
+
+
+def test_colours_are_those_of_the_panel_and_a_caption_is_as_wide_as_asked():
+    image = grey_image(400, 300)
+    points = [[40.0, 60.0], [200.0, 150.0]]
+    for mask, expected in (([True, True], RIGHT_AND_WRONG[0]), ([False, False], RIGHT_AND_WRONG[1])):
+        row = MatchPanel(np.array(mask), words=("right", "wrong"), colours=RIGHT_AND_WRONG)
+        picture = draw_matches(image, image, points, points, row)[drawing.HEADER_PX :]
+        shift = picture.astype(int).max(axis=(0, 1)) - picture.astype(int).min(axis=(0, 1))
+        assert np.argmax(shift) == np.argmax(expected)
+    for width in (30, 700):
+        strip = caption(width, "4001 raw matches, 397 of them right")
+        assert strip.shape == (drawing.HEADER_PX, width, 3)
+        assert strip.std() > 0
 
 
 def test_before_after_stacks_both_panels():

@@ -119,7 +119,11 @@ def test_replacing_find_essential_mat_finds_the_pose():
 @pytest.mark.slow
 def test_before_after_draws_a_picture(tmp_path):
     path = tmp_path / "new folder" / "picture.png"
-    assert "RANSAC alone" in run_example("before_after.py", "--out", str(path))
+    told = run_example("before_after.py", "--out", str(path)).splitlines()
+    assert "true pose: rotation 37.3 deg" in told[0]
+    right, wrong = ([int(line.split(f" {word}")[0].split()[-1]) for line in told[1:]] for word in ("right", "wrong"))
+    assert right[1] > 2 * right[0]
+    assert wrong[1] < wrong[0]
     picture = cv2.imread(str(path))
     assert picture.shape[1] >= 1000
     assert picture.shape[0] > picture.shape[1] * 0.6

@@ -7,9 +7,12 @@ import struct
 import cv2
 import numpy as np
 import pytest
-from image_files import promising
+from image_files import promising, turned
 
-from mgca_filter.images import decode_image, principal_point_doubt
+from mgca_filter.exif import exif_orientation
+from mgca_filter.geometry.orientation import shown_pixels, shown_size
+from mgca_filter.image_header import promised_size
+from mgca_filter.images import decode_image, decode_photo, principal_point_doubt
 
 AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -79,10 +82,87 @@ def test_what_is_no_image_is_a_value_error(data: bytes) -> None:
         decode_image(data)
 
 
-@pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tiff", ".ppm"])
-def test_too_many_pixels_are_a_value_error(suffix: str) -> None:
-    with pytest.raises(ValueError, match=r"too large|not an image"):
-        decode_image(promising(suffix, 65_000, 65_000))
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp", ".tiff"])
+def test_a_photo_is_shown_as_its_exif_says(suffix: str, orientation: int, grey: np.ndarray) -> None:
+    """As cv2.imread shows it, and the orientation leads back to what is stored."""
+    data = turned(suffix, grey, orientation)
+    shown, found = decode_photo(data)
+    assert found == orientation
+    np.testing.assert_array_equal(shown, cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR))
+    stored = decode_photo(turned(suffix, grey, 1))[0]
+    size = (stored.shape[1], stored.shape[0])
+    assert shown_size(orientation, size) == (shown.shape[1], shown.shape[0])
+    T = shown_pixels(orientation, size)
+    for x, y in ((0, 0), (3, 7), (size[0] - 1, size[1] - 2)):
+        u, v, _ = (T @ [x, y, 1]).astype(int)
+        assert shown[v, u].tolist() == stored[y, x].tolist()
+
+
+def test_what_carries_no_exif_is_shown_as_it_is(grey: np.ndarray) -> None:
+    for suffix in (".bmp", ".pgm", ".png"):
+        shown, orientation = decode_photo(encoded(grey, suffix))
+        assert orientation == 1
+        np.testing.assert_array_equal(shown[:, :, 0], grey)
+
+
+FORMATS = [
+    *(".png", ".jpg", ".webp", ".tiff", ".bmp", ".ppm", ".pfm", ".pam", ".hdr", ".sr", ".gif", ".jp2", ".avif"),
+]
+
+
+def written(suffix: str, image: np.ndarray) -> bytes:
+    if not cv2.haveImageWriter(f"x{suffix}"):
+        pytest.skip(f"this OpenCV writes no {suffix}")
+    try:
+        return encoded(image, suffix)
+    except cv2.error:
+        return encoded(image.astype(np.float32), suffix)
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_the_header_tells_the_size(suffix: str) -> None:
+    image = np.random.default_rng(0).integers(0, 256, (37, 53, 3), dtype=np.uint8)
+    data = written(suffix, image)
+    assert promised_size(data) == (53, 37)
+    for length in range(0, min(len(data), 700)):
+        assert promised_size(data[:length]) in (None, (53, 37))
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_a_file_that_promises_too_much_is_refused_before_it_is_decoded(
+    suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under OpenCV's own limit of 2^30, where it would allocate gigabytes."""
+    written(suffix, np.zeros((48, 72, 3), np.uint8))
+    monkeypatch.setattr(cv2, "imdecode", lambda *arguments: pytest.fail("it was decoded"))
+    width, height = (16_384, 16_384) if suffix == ".webp" else (30_000, 30_000)
+    if suffix == ".webp":  # whose sides are at most 16384: at the limit, not above it
+        monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", str(16_383 * 16_384))
+    with pytest.raises(ValueError, match=f"promises {width} x {height} pixels, more than"):
+        decode_photo(promising(suffix, width, height))
+
+
+def test_the_environment_moves_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = encoded(np.zeros((20, 30), np.uint8))
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", "599")
+    with pytest.raises(ValueError, match="more than 599; OPENCV_IO_MAX_IMAGE_PIXELS"):
+        decode_image(data)
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", "600")
+    assert decode_image(data).shape == (20, 30, 3)
+    monkeypatch.setenv("OPENCV_IO_MAX_IMAGE_PIXELS", "many")
+    assert decode_image(data).shape == (20, 30, 3)
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".png", ".jpg"])
+def test_headers_of_any_bytes_raise_nothing(suffix: str, grey: np.ndarray) -> None:
+    rng, good = np.random.default_rng(0), encoded(grey, suffix)
+    for _ in range(300):
+        data = bytearray(good[: rng.integers(1, 400)])
+        for place in rng.integers(0, len(data), 6):
+            data[place] = rng.integers(256)
+        promised_size(bytes(data))
+        exif_orientation(bytes(data))
 
 
 def camera(f: float, x: float, y: float) -> np.ndarray:

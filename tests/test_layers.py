@@ -29,10 +29,10 @@ FLOORS = (
     ("inputs",),
     ("html_report",),
     ("result",),
-    ("network", "drawing", "exif", "images", "tables", "verdict_text"),
-    ("geometry",),
+    ("network", "drawing", "images", "tables", "verdict_text"),
+    ("exif", "geometry", "image_header", "input_file"),
     ("types", "atomic_file"),
-    ("errors",),
+    ("errors", "opencv_version"),
 )
 HEIGHT = {room: -index for index, floor in enumerate(FLOORS) for room in floor}
 

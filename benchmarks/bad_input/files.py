@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 import zlib
 from collections.abc import Callable
@@ -56,6 +57,30 @@ def _with_segment(content: bytes) -> Callable[[Path, bytes], object]:
     return write
 
 
+def _orientation(value: int) -> bytes:
+    return b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0x0112, 3, 1, value, 0, 0)
+
+
+def _jpeg_that_promises(good: bytes) -> bytes:
+    data = bytearray(cv2.imencode(".jpg", _grey(good))[1].tobytes())
+    frame = data.index(b"\xff\xc0")
+    data[frame + 5 : frame + 9] = struct.pack(">HH", 30_000, 30_000)
+    return bytes(data)
+
+
+def _bmp_that_promises(good: bytes) -> bytes:
+    data = bytearray(cv2.imencode(".bmp", _grey(good))[1].tobytes())
+    data[18:26] = struct.pack("<ii", 30_000, -30_000)
+    return bytes(data)
+
+
+def _terabyte(path: Path, good: bytes) -> None:
+    """It takes no room on the disk."""
+    path.write_bytes(good)
+    os.truncate(path, 2**40)
+
+
+_GIF = b"GIF89a" + struct.pack("<HH", 65_000, 65_000) + b"\xf0\0\0" + bytes(6) + b";"
 _GARBAGE = np.random.default_rng(2).integers(0, 256, 3000, dtype=np.uint8).tobytes()
 _TURNS_IN_CIRCLES = b"II*\0" + struct.pack("<IHHHII", 8, 1, 0x8769, 4, 1, 8)
 _ABSURD_FOCAL_LENGTH = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 0xA405, 3, 1, 65_535, 0, 0)
@@ -81,6 +106,19 @@ FILES: dict[str, tuple[Callable[[Path, bytes], object], tuple[int, ...]]] = {
     ),
     "promises 100 000 x 100 000": (lambda path, good: path.write_bytes(png_that_promises(100_000, 100_000)), (2,)),
     "promises 30 000 x 30 000": (lambda path, good: path.write_bytes(png_that_promises(30_000, 30_000)), (2,)),
+    "promises 20 000 x 20 000": (lambda path, good: path.write_bytes(png_that_promises(20_000, 20_000)), (2,)),
+    "JPEG that promises 30 000 x 30 000": (lambda path, good: path.write_bytes(_jpeg_that_promises(good)), (2,)),
+    "BMP that promises 30 000 x 30 000": (lambda path, good: path.write_bytes(_bmp_that_promises(good)), (2,)),
+    "GIF that promises 65 000 x 65 000": (lambda path, good: path.write_bytes(_GIF), (2,)),
+    "PPM that promises 30 000 x 30 000": (
+        lambda path, good: path.write_bytes(b"P6\n# x\n30000 30000\n255\n" + good),
+        (2,),
+    ),
+    "TIFF whose directory is itself": (lambda path, good: path.write_bytes(b"II*\0\4\0\0\0" + good), (2,)),
+    "a terabyte": (_terabyte, (2,)),
+    "EXIF: turned": (_with_segment(_orientation(6)), (0,)),
+    "EXIF: mirrored": (_with_segment(_orientation(2)), (1, 0)),
+    "EXIF: orientation 99": (_with_segment(_orientation(99)), (0,)),
     "promises 0 x 0": (lambda path, good: path.write_bytes(png_that_promises(0, 0)), (2,)),
     "one colour": (_flat, (1,)),
     "one pixel": (_one_pixel, (1,)),

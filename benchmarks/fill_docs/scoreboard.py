@@ -1,9 +1,10 @@
-"""Put the scoreboard into README, model card and figures: ``python -m benchmarks.fill_docs.scoreboard FILE``.
+"""Put the scoreboard into its page, README, model card and figures: ``python -m benchmarks.fill_docs.scoreboard FILE``.
 
-``FILE`` comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures need matplotlib;
-those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best baseline and
-plain RANSAC keep of the example pair: right matches green, wrong ones red. The model card also gets the figures by
-scene and by difficulty, beside those of the strongest baselines.
+The whole of it stands once, in ``docs/reference/scoreboard.md``; README and model card get six rows of it, the README a
+plot of eight. ``FILE`` comes from ``python -m mgca_filter.evaluation BUNDLES --json docs/scoreboard.json``. Figures
+need matplotlib; those that the file holds the curves for are written to ``docs/figures``, and what the filter, its best
+baseline and plain RANSAC keep of the example pair: right matches green, wrong ones red. The model card also gets the
+figures by scene and by difficulty, beside those of the strongest baselines.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ from mgca_filter.evaluation.registry import BASELINE_ROWS, parse_method
 from mgca_filter.evaluation.summary import Summary, best_baseline
 from mgca_filter.tables import render_table
 
+from . import readme_plot
 from .pages import fill_file
 
 ROOT = Path(__file__).resolve().parents[2]
-README, MODEL_CARD = "README.md", "mgca_filter/models/mgca_small.md"
+README, MODEL_CARD, PAGE = "README.md", "mgca_filter/models/mgca_small.md", "docs/reference/scoreboard.md"
 FIGURES = "docs/figures"
 EXAMPLE = "examples/images/courtyard.txt"
 COLUMNS = ("mAP@5", "mAP@20", "AUC@5", "AUC@10", "AUC@20", "P", "R", "F", "median_ms")
@@ -110,11 +112,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         summary = Summary.read(options.scoreboard)
-        places = {"scoreboard": scoreboard(summary)}
+        board = scoreboard(summary)
     except ValueError as error:
         raise SystemExit(f"error: {error}") from error
-    fill_file(options.root / README, places)
-    fill_file(options.root / MODEL_CARD, {**places, "difficulty": difficulty(summary)})
+    results = {"results": readme_plot.results_table(summary)}
+    fill_file(options.root / README, results)
+    fill_file(options.root / PAGE, {"scoreboard": board})
+    fill_file(options.root / MODEL_CARD, {**results, "difficulty": difficulty(summary)})
+    print(readme_plot.draw(summary, options.root / readme_plot.PLOT))
     pictured = dict.fromkeys([BASELINE_ROWS[0], best_baseline(summary.rows, "product"), "product"])
     rows = [parse_method(name) for name in pictured]
     example = select_pairs(ROOT / EXAMPLE, data_format="pairs")

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
 import cv2
-import numpy as np
-from numpy.typing import NDArray
 
 from ..features import DEFAULT_DETECTOR, DEFAULT_FEATURE_COUNT, DETECTORS
+from ..inference.onnxruntime_ import available_providers
 from ..inputs.options import EFFORTS, GEOMETRIES, METHODS, FilterOptions
 
 EXIT_FOUND, EXIT_NO_GEOMETRY, EXIT_USAGE = 0, 1, 2
+# Thresholds, pixels, that are hardly meant as such.
+_TINY_PX, _HUGE_PX = 0.05, 30.0
+_FEW_KEYPOINTS = 100
 
 
 class UsageError(Exception):
@@ -79,8 +83,58 @@ def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = 
     group.add_argument(
         "--model", metavar="FILE", type=Path, help="default, fast, or a model file (.onnx, .safetensors)"
     )
-    group.add_argument("--providers", metavar="A,B", help="ONNX Runtime execution providers, in order")
+    add_providers_option(group)
     group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")
+
+
+def add_providers_option(parser: Any) -> None:
+    """``--providers``, for a parser or a group of its options."""
+    parser.add_argument(
+        "--providers",
+        metavar="A,B",
+        type=providers,
+        help='ONNX Runtime\'s execution providers, in order, such as "cuda,cpu"; "list" prints those that are there',
+    )
+
+
+def providers(text: str) -> list[str]:
+    """Names of execution providers, in ONNX Runtime's spelling; ``list`` prints them all and ends the program."""
+    known = available_providers()
+    if text == "list":
+        print("\n".join(known))
+        sys.exit(EXIT_FOUND)
+    short = {name.removesuffix("ExecutionProvider").lower(): name for name in known}
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    names = [short.get(word.removesuffix("ExecutionProvider").lower(), word) for word in words]
+    if not any(name in known for name in names):
+        raise argparse.ArgumentTypeError(f"this ONNX Runtime has {', '.join(known)}, and not {text!r}")
+    return names
+
+
+def doubtful_options(options: argparse.Namespace) -> list[str]:
+    """Sentences on options that hardly do what they are given for."""
+    doubts = []
+    if options.threshold < _TINY_PX:
+        doubts.append(
+            f"--threshold {options.threshold:g} is in pixels, and keypoints are not that exact: next to nothing is "
+            "kept. One of the normalised plane, times the focal length, is one in pixels"
+        )
+    if options.threshold > _HUGE_PX:
+        doubts.append(f"--threshold {options.threshold:g} is in pixels: matches that far off count as right")
+    if options.keep_precision is not None and options.threshold != FilterOptions.threshold:
+        doubts.append("--keep-precision decides what is kept: --threshold has no say")
+    if getattr(options, "max_keypoints", DEFAULT_FEATURE_COUNT) < _FEW_KEYPOINTS:
+        doubts.append(f"--max-keypoints {options.max_keypoints} of an image: too few to tell right matches from chance")
+    return doubts
+
+
+def warnings_in_one_line(say: Callable[[str], None]) -> None:
+    """Hand what Python's ``warnings`` would print, with a place in the source, to ``say`` as it stands."""
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        say(f"warning: {' '.join(str(message).split())}")
+
+    warnings.showwarning = show
 
 
 def filter_options(options: argparse.Namespace) -> dict[str, Any]:
@@ -92,25 +146,18 @@ def filter_options(options: argparse.Namespace) -> dict[str, Any]:
         "effort": options.effort,
         "geometry": options.geometry,
         "model": None if options.model is None else str(options.model),
-        "providers": options.providers.split(",") if options.providers else None,
+        "providers": options.providers,
         "seed": options.seed,
     }
 
 
 def quiet_codecs() -> None:
     """Keep OpenCV's log of what is wrong with an image off stderr: the command says so itself, in one line."""
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-
-
-def intrinsics(text: str) -> NDArray[np.float64]:
-    """K (3, 3) from ``fx,fy,cx,cy``."""
-    try:
-        fx, fy, cx, cy = (float(word) for word in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected fx,fy,cx,cy in pixels, got {text!r}") from None
-    if not all(math.isfinite(value) for value in (fx, fy, cx, cy)) or fx <= 0 or fy <= 0:
-        raise argparse.ArgumentTypeError(f"expected finite numbers and positive focal lengths, got {text!r}")
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    logging = getattr(cv2.utils, "logging", None)
+    if logging is not None:
+        logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+    else:  # OpenCV 4.10 has it elsewhere
+        getattr(cv2, "setLogLevel")(0)  # noqa: B009  # which newer stubs do not know
 
 
 def positive(kind: type[int] | type[float]) -> Callable[[str], float]:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ..fit.evidence import Evidence, distinct_rows, one_to_one
 from ..fit.robust_fit import fit_alone
-from ..geometry.cameras import mean_focal_length, resolve_intrinsics
+from ..geometry.cameras import Distortion, mean_focal_length, resolve_intrinsics
 from ..geometry.epipolar import rotation_error_deg, sampson_distance
 from ..inputs.options import FilterOptions
 from ..result import FilterResult
+from .truth import TruePose
 
 BASELINES = {"RANSAC": "ransac", "MAGSAC": "magsac"}
 
@@ -53,6 +54,8 @@ def fit_baselines(
     size2: tuple[int, int],
     threshold_px: float,
     seed: int = 0,
+    dist1: Distortion | None = None,
+    dist2: Distortion | None = None,
 ) -> list[BaselineFit]:
     """Fit by each baseline, with the filter's threshold and OpenCV's usual confidence.
 
@@ -62,8 +65,11 @@ def fit_baselines(
         size1, size2: (width, height) of the images, for that guess.
         threshold_px: inlier threshold, pixels.
         seed: of the estimators' random numbers.
+        dist1, dist2: lens distortion, as of the filter.
     """
-    camera1, camera2 = resolve_intrinsics(points1, points2, K1=K1, K2=K2, size1=size1, size2=size2)
+    camera1, camera2 = resolve_intrinsics(
+        points1, points2, K1=K1, K2=K2, dist1=dist1, dist2=dist2, size1=size1, size2=size2
+    )
     correspondences = np.hstack([camera1.normalize(points1), camera2.normalize(points2)])
     focal_px = mean_focal_length(camera1.K, camera2.K)
     fits = []
@@ -101,15 +107,38 @@ def describe_translation(t: NDArray[np.float64] | None) -> str:
     return "-" if t is None else "(" + ", ".join(f"{value:+.2f}" for value in t) + ")"
 
 
-def comparison_table(result: FilterResult, filter_ms: float, baselines: Sequence[BaselineFit]) -> str:
+def comparison_table(
+    result: FilterResult,
+    filter_ms: float,
+    baselines: Sequence[BaselineFit],
+    truth: TruePose | None = None,
+    right: NDArray[np.bool_] | None = None,
+) -> str:
     """Counts, poses and times of the filter and the baselines, one row each.
 
-    A count of kept matches is no accuracy: a wrong model gathers matches as well.
+    A count of kept matches is no accuracy: a wrong model gathers matches as well. With the true pose the table says how
+    far each pose is off, and with ``right`` (M,), which matches are right by it, how many of the kept ones are.
     """
-    rows = [("mgca_filter", result.num_inliers, result.R, result.t, filter_ms)]
-    rows += [(fit.name, fit.num_inliers, fit.R, fit.t, fit.fit_ms) for fit in baselines]
-    lines = [f"{'':<12} {'kept':>6}  {'rotation':>9}  {'translation':<21}  {'time':>9}"]
-    for name, kept, R, t, ms in rows:
-        rotation, translation = describe_rotation(R), describe_translation(t)
-        lines.append(f"{name:<12} {kept:>6}  {rotation:>9}  {translation:<21}  {ms:>6.0f} ms")
+    rows: list[FilterResult | BaselineFit] = [result, *baselines]
+    columns: list[tuple[str, str, list[str]]] = [
+        ("", "<", ["mgca_filter", *(fit.name for fit in baselines)]),
+        ("kept", ">", [str(row.num_inliers) for row in rows]),
+    ]
+    if right is not None:
+        columns.append(("right", ">", [str(int(np.count_nonzero(row.mask & right))) for row in rows]))
+    columns += [
+        ("rotation", ">", [describe_rotation(row.R) for row in rows]),
+        ("translation", "<", [describe_translation(row.t) for row in rows]),
+    ]
+    if truth is not None:
+        errors = [truth.errors_deg(row.R, row.t) for row in rows]
+        for name, place in (("rotation off", 0), ("translation off", 1)):
+            found = [error[place] for error in errors]
+            columns.append((name, ">", ["-" if off is None else f"{off:.2f} deg" for off in found]))
+    columns.append(("time", ">", [f"{ms:.0f} ms" for ms in (filter_ms, *(fit.fit_ms for fit in baselines))]))
+    widths = [max(len(cell) for cell in (head, *cells)) for head, _, cells in columns]
+    lines = []
+    for k in range(-1, len(rows)):
+        cells = [head if k < 0 else cells[k] for head, _, cells in columns]
+        lines.append("  ".join(f"{cell:{side}{width}}" for cell, (_, side, _), width in zip(cells, columns, widths)))
     return "\n".join(lines)

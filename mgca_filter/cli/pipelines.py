@@ -6,9 +6,13 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import MgcaFilterError
 from ..pipelines.run import Report, Summary, Workers
@@ -20,19 +24,24 @@ from .arguments import (
     UsageError,
     add_detector_options,
     add_filter_options,
+    doubtful_options,
     filter_options,
-    intrinsics,
     one_line,
     positive,
     quiet_codecs,
+    warnings_in_one_line,
 )
+from .cameras import CameraArgument, camera
 
+DEFAULT_OVERLAP = 10
 _EPILOG = """\
 exit status: 0 = geometry found for one pair at least, 1 = for none, 2 = wrong usage, or a file that cannot be read or
 written. A killed run goes on where it stopped when the same command is given again."""
 _FOLDER_EPILOG = """\
-Pixels are those of the file as it is stored: like COLMAP and hloc, and unlike "mgca-match img1 img2", this command does
-not turn photos as their EXIF says, and --K is for the photo as it is stored.
+Photos are matched as their EXIF says that they are to be shown, as by "mgca-match img1 img2". OUT.jsonl is in those
+pixels. COLMAP and hloc read files as they are stored: in OUT.db and OUT.h5 keypoints, cameras and geometry are turned
+back to the pixels of the files. --K is for the photos as they are shown or as they are stored: of one camera held
+upright and sideways, one K fits all photos.
 
 """
 # What every command needs, and its own extra brings; and the extras that bring other packages.
@@ -90,8 +99,13 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
     command.add_argument(
         "--pairs", metavar="FILE|exhaustive|sequential", default="exhaustive", help="which to match, default exhaustive"
     )
-    command.add_argument("--overlap", metavar="N", type=positive(int), default=10, help="sequential: N next images")
-    command.add_argument("--K", metavar="fx,fy,cx,cy", type=intrinsics, help="intrinsics of all images, pixels")
+    command.add_argument("--overlap", metavar="N", type=positive(int), help="sequential: N next images, default 10")
+    command.add_argument(
+        "--K",
+        metavar="K",
+        type=camera,
+        help='intrinsics of all images: fx,fy,cx,cy in pixels or a file, as of "mgca-match img1 img2"',
+    )
     command.add_argument("--no-exif", action="store_true", help="without --K: guess the focal length, do not read EXIF")
     add_detector_options(command)
     command.add_argument("--cache", metavar="DIR", type=Path, help="keep the features there for other runs")
@@ -174,11 +188,15 @@ def _run_folder(options: argparse.Namespace) -> Summary:
         raise UsageError(f"{options.output}: expected a name that ends in {', '.join(OUTPUTS)}")
     _check_output(options, options.output, [])
     import_module(OUTPUTS[options.output.suffix])
+    if options.overlap is not None and options.pairs != "sequential":
+        _say(options, "warning: --overlap goes with --pairs sequential")
+    if options.no_exif and options.K is not None:
+        _say(options, "warning: --no-exif has no say where K is given")
     names = list_images(options.images)
     if options.pairs == "exhaustive":
         pairs = exhaustive_pairs(names)
     elif options.pairs == "sequential":
-        pairs = sequential_pairs(names, options.overlap)
+        pairs = sequential_pairs(names, options.overlap or DEFAULT_OVERLAP)
     else:
         pairs = read_pairs(Path(options.pairs), names, options.images)
     if not pairs:
@@ -187,7 +205,7 @@ def _run_folder(options: argparse.Namespace) -> Summary:
         options.images,
         pairs,
         options.output,
-        options.K,
+        None if options.K is None else _pinhole(options.K),
         options.detector,
         options.max_keypoints,
         options.cache,
@@ -197,10 +215,27 @@ def _run_folder(options: argparse.Namespace) -> Summary:
     return _with_workers(job, options)
 
 
+def _pinhole(argument: CameraArgument) -> NDArray[np.float64]:
+    """The one K of all images."""
+    one = argument.only()
+    if one.distortion is not None:
+        raise UsageError(
+            f"--K {one.source}: has lens distortion, which this command does not remove: undistort the images"
+        )
+    return one.K
+
+
+def _say(options: argparse.Namespace, message: str) -> None:
+    if not options.quiet:
+        print(f"mgca-match: {message}", file=sys.stderr)
+
+
 def _with_workers(job: Any, options: argparse.Namespace) -> Summary:
     if options.address is not None and options.engine != "ray":
         raise UsageError("--address goes with --engine ray")
     settings = filter_options(options)
+    for doubt in doubtful_options(options):
+        _say(options, f"warning: {doubt}")
     with Workers(settings, options.jobs, options.engine, options.address) as workers:
         summary: Summary = job.run(workers, settings, options.quiet)
     for message in [*summary.failures, *([] if options.quiet else summary.doubts)]:
@@ -213,9 +248,10 @@ def _with_workers(job: Any, options: argparse.Namespace) -> Summary:
 def main(arguments: Sequence[str]) -> int:
     """Run a subcommand; returns the exit status (0 = geometry found, 1 = for no pair, 2 = usage or files)."""
     try:
+        quiet_codecs()
         options = build_parser().parse_args(arguments)
         options.command_line = shlex.join(["mgca-match", *arguments])
-        quiet_codecs()
+        warnings_in_one_line(partial(_say, options))
         for package in _PACKAGES + (["ray"] if options.engine == "ray" else []):
             import_module(package)  # better missed now than when all pairs are done
         summary = options.run(options)

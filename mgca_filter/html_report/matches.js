@@ -39,7 +39,7 @@ const state = {
   threshold: { ...OWN },
   moved: false,
   selected: Uint8Array.from(matches.own),
-  rival: DATA.methods.length > 1 ? DATA.methods.length - 1 : -1,
+  baseline: DATA.methods.length > 1 ? DATA.methods.length - 1 : -1,
   groups: { both: true, ours: true, theirs: true, neither: false },
 };
 
@@ -55,7 +55,7 @@ function reselect() {
 
 // In the comparison: who keeps match i.
 function group(i) {
-  const [ours, theirs] = [matches.own[i], state.rival < 0 ? 0 : methodMasks[state.rival][i]];
+  const [ours, theirs] = [matches.own[i], state.baseline < 0 ? 0 : methodMasks[state.baseline][i]];
   return ours ? (theirs ? "both" : "ours") : theirs ? "theirs" : "neither";
 }
 

@@ -136,7 +136,7 @@ function createMatchPanel(viewer, changed) {
 function createComparePanel(changed) {
   const side = byId("side-compare");
   const home = el("div", {});
-  if (state.rival < 0) {
+  if (state.baseline < 0) {
     side.append(home, el("div", { class: "card" }, el("h2", {}, "Compare"), el("p", {}, "No other method ran on these matches. On the command line ",
       el("code", {}, "--compare"), " adds RANSAC and MAGSAC; in Python it is the argument ", el("code", {}, "baselines"), ".")));
     return { update() {}, differences() {}, home };
@@ -148,9 +148,9 @@ function createComparePanel(changed) {
   const table = el("table", {}, el("caption", { class: "unseen" }, "Methods on the same matches"),
     el("thead", {}, el("tr", {}, ...head.map((word) => el("th", { scope: "col", title: word === "pose" ? "Larger of the errors of rotation and translation direction" : null }, word)))),
     el("tbody", {}, ...DATA.methods.map((method, m) => {
-      const radio = m === 0 ? null : el("input", { type: "radio", name: "rival", id: `rival-${m}`, onchange: () => { state.rival = m; changed(); } });
+      const radio = m === 0 ? null : el("input", { type: "radio", name: "baseline", id: `baseline-${m}`, onchange: () => { state.baseline = m; changed(); } });
       if (radio) radios.push([radio, m]);
-      const name = radio ? el("label", { for: `rival-${m}` }, radio, " ", method.name) : el("strong", {}, method.name);
+      const name = radio ? el("label", { for: `baseline-${m}` }, radio, " ", method.name) : el("strong", {}, method.name);
       const cells = [count(method.kept), ...(truth ? [count(method.right), count(method.wrong)] : []),
         ...(errors ? [method.error_deg == null ? "–" : `${fixed(method.error_deg, 1)}°`] : []), duration(method.ms)];
       return el("tr", {}, el("th", { scope: "row" }, name), ...cells.map((cell) => el("td", {}, cell)));
@@ -171,8 +171,8 @@ function createComparePanel(changed) {
   function update() {
     const tally = { both: [0, 0], ours: [0, 0], theirs: [0, 0], neither: [0, 0] };
     for (let i = 0; i < matches.n; i++) tally[group(i)][matches.right && !matches.right[i] ? 1 : 0]++;
-    const rival = DATA.methods[state.rival].name;
-    const words = { both: "both", ours: "mgca_filter only", theirs: `${rival} only`, neither: "neither" };
+    const baseline = DATA.methods[state.baseline].name;
+    const words = { both: "both", ours: "mgca_filter only", theirs: `${baseline} only`, neither: "neither" };
     groups.replaceChildren(...Object.keys(words).map((name) => {
       const box = el("input", { type: "checkbox", id: `group-${name}`, onchange: () => { state.groups[name] = box.checked; changed(); } });
       box.checked = state.groups[name];
@@ -182,7 +182,7 @@ function createComparePanel(changed) {
       if (spoken) box.setAttribute("aria-label", spoken);
       return el("label", { for: `group-${name}`, class: `group ${name}` }, box, el("i", { "aria-hidden": "true" }), el("span", {}, words[name]), ...numbers);
     }));
-    radios.forEach(([radio, m]) => { radio.checked = m === state.rival; });
+    radios.forEach(([radio, m]) => { radio.checked = m === state.baseline; });
     only.checked = !state.groups.both && state.groups.ours && state.groups.theirs && !state.groups.neither;
   }
   return { update, differences, home };

@@ -23,6 +23,7 @@ _LOG_ERRORS_ONLY = 3
 # The product that this fusion makes of a mean over the matches rounds by the number of threads, and what a rounding
 # moves across a nearest-neighbour choice moves logits by tenths. Without it all numbers of threads give the same bits.
 _DISABLED_OPTIMIZERS = ["MatMulScaleFusion"]
+PROVIDERS_VARIABLE = "MGCA_FILTER_PROVIDERS"
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"
 TELEMETRY_VARIABLE = "ORT_DISABLE_TELEMETRY"
 
@@ -34,7 +35,8 @@ class OnnxBackend:
 
     Args:
         path: the ``.onnx`` file.
-        providers: execution providers in ONNX Runtime's form; None = CPU. One that is missing or fails gives
+        providers: execution providers in ONNX Runtime's form; None = those that the environment variable
+            ``MGCA_FILTER_PROVIDERS`` lists, separated by commas, else the CPU. One that is missing or fails gives
             way to the CPU with one warning.
 
     Raises:
@@ -78,6 +80,18 @@ class OnnxBackend:
         OnnxBackend.__init__(self, state["path"], state["providers"])
 
 
+def available_providers() -> list[str]:
+    """Execution providers of the ONNX Runtime that is installed, the preferred ones first.
+
+    Raises:
+        BackendError: ONNX Runtime is not installed or does not start.
+    """
+    try:
+        return list(_import_runtime().get_available_providers())
+    except Exception as error:
+        raise BackendError(f"ONNX Runtime cannot be imported ({error})") from error
+
+
 def _import_runtime() -> Any:
     """ONNX Runtime, told not to report home: from 1.29 on it would on Linux as well, from the import on."""
     wish = os.environ.setdefault(TELEMETRY_VARIABLE, "1")
@@ -91,7 +105,7 @@ def _import_runtime() -> Any:
 def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) -> onnxruntime.InferenceSession:
     """Open what was read with the wanted providers, else on the CPU with one warning."""
     options = _session_options(runtime)
-    wanted = list(providers) if providers else [CPU_PROVIDER]
+    wanted = list(providers) if providers else os.environ.get(PROVIDERS_VARIABLE, CPU_PROVIDER).split(",")
     names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
     missing = [name for name in names if name not in runtime.get_available_providers()]
     usable = [provider for provider, name in zip(wanted, names) if name not in missing]

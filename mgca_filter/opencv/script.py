@@ -1,4 +1,4 @@
-"""``python -m mgca_filter run script.py``: an unchanged OpenCV script with the filter in place, and what changed.
+"""``mgca-match run script.py``: an unchanged OpenCV script with the filter in place, and what changed.
 
 Every call that the filter takes over is also made to OpenCV's own function, on the same arguments, for the table that
 is printed on standard error when the script ends. The script goes on with the filter's answer. Below the table stands
@@ -7,7 +7,6 @@ what the filter did not see: calls of OpenCV's other estimators, and processes t
 
 from __future__ import annotations
 
-import argparse
 import multiprocessing
 import os
 import runpy
@@ -24,11 +23,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ..errors import MgcaFilterError
-from ..match_filter import MatchFilter
 from .patch import TWINS, locate, swapped
 
-EXIT_USAGE = 2
 UNCOVERED = ("recoverPose", "estimateTranslation2D")
 """OpenCV's other robust estimators between two images; ``recoverPose`` is one where it fits E itself."""
 
@@ -171,21 +167,3 @@ def run_script(path: Path, arguments: Sequence[str]) -> CallLog:
         sys.stdout.flush()
         print(f"\nmgca_filter in place of OpenCV in {path}\n{log.table()}", file=sys.stderr)
     return log
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; 0 = the script ended, 2 = there is no script or no filter; else what the script exits with."""
-    parser = argparse.ArgumentParser(prog="mgca-match run", description=__doc__)
-    parser.add_argument("script", type=Path, help="Python script that calls cv2")
-    parser.add_argument("arguments", nargs=argparse.REMAINDER, help="what the script gets")
-    options = parser.parse_args(arguments)
-    if not options.script.is_file():
-        print(f"mgca_filter run: {options.script}: no such file", file=sys.stderr)
-        return EXIT_USAGE
-    try:
-        MatchFilter()  # opens the model, so that the first call's time is that of a call
-    except MgcaFilterError as error:
-        print(f"mgca_filter run: {error}", file=sys.stderr)
-        return EXIT_USAGE
-    run_script(options.script, options.arguments)
-    return 0

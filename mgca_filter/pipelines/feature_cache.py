@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 
 from ..features import ImageFeatures, detector_resolution
+from ..images import MAX_FILE_BYTES
+from ..input_file import read_bytes
 from .journal import file_stamp, output_file
 from .run import Workers, progress_bar
 
 # Of what is in a file; another one, and all images are read again.
-_REVISION = 2
+_REVISION = 3
 _UNREADABLE = (OSError, ValueError, KeyError, zipfile.BadZipFile)
 
 
@@ -45,11 +47,11 @@ class FeatureCache:
                 yield name, _bytes_or_none(self.images / name), self.detector, self.max_keypoints
 
         with progress_bar("images", len(names), len(names) - len(missing), quiet) as bar:
-            for name, features in workers.map("extract", tasks()):
+            for name, features, orientation in workers.map("extract", tasks()):
                 if features is None:
                     unreadable.append(name)
                 else:
-                    self._write(name, features)
+                    self._write(name, features, orientation)
                 bar.update()
         return sorted(unreadable)
 
@@ -66,16 +68,16 @@ class FeatureCache:
             table[:, :2], table[:, 2], table[:, 3], descriptors, K if K.size else None, size, detector_resolution(size)
         )
 
-    def size(self, name: str) -> tuple[int, int] | None:
-        """(width, height) of an image in pixels; None where there are no features of it."""
+    def shape(self, name: str) -> tuple[tuple[int, int], int] | None:
+        """(width, height) of an image as it is shown, and its EXIF orientation; None where there are no features."""
         try:
             with np.load(self._path(name)) as data:
-                width, height = data["image_size"]
+                (width, height), orientation = data["image_size"], data["orientation"]
         except _UNREADABLE:
             return None
-        return int(width), int(height)
+        return (int(width), int(height)), int(orientation)
 
-    def _write(self, name: str, features: ImageFeatures) -> None:
+    def _write(self, name: str, features: ImageFeatures, orientation: int) -> None:
         size, angle, descriptors = (np.asarray(v) for v in (features.size, features.angle, features.descriptors))
         with output_file(self._path(name)) as partial, partial.open("wb") as file:
             np.savez(
@@ -84,6 +86,7 @@ class FeatureCache:
                 descriptors=descriptors,
                 image_size=np.array(features.image_size),
                 K=np.zeros((0, 0)) if features.K is None else features.K,
+                orientation=np.array(orientation),
             )
 
     def _path(self, name: str) -> Path:
@@ -92,8 +95,8 @@ class FeatureCache:
 
 
 def _bytes_or_none(path: Path) -> bytes:
-    """The file, empty where it cannot be read: one bad image does not stop the others."""
+    """The file, empty where it cannot be read or is too long: one bad image does not stop the others."""
     try:
-        return path.read_bytes()
-    except OSError:
+        return read_bytes(path, MAX_FILE_BYTES)
+    except (OSError, ValueError):
         return b""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections import Counter
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -15,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..features import DEFAULT_DETECTOR, DEFAULT_FEATURE_COUNT, ImageFeatures
-from ..images import principal_point_doubt
+from ..images import intrinsics_as_shown, principal_point_doubt, size_of_intrinsics
+from ..input_file import read_text
 from .feature_cache import FeatureCache
 from .journal import Journal, PipelineError, output_file
 from .run import Report, Summary, Workers, run_identity, run_pairs, work_folder
+from .stored_pixels import stored_features, stored_row
 from .worker import PairRow, Unusable
 
 ReadFeatures = Callable[[str], ImageFeatures | None]
@@ -61,29 +63,38 @@ def read_pairs(path: Path, names: Sequence[str], folder: Path) -> list[tuple[str
         PipelineError: the file cannot be read, a line has not two names, or names an image that ``names`` lacks.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PipelineError(f"{path}: {getattr(error, 'strerror', None) or 'not a text file'}") from error
-    known, pairs = set(names), dict[frozenset[str], tuple[str, str]]()
+        lines = read_text(path, may_be_empty=True).splitlines()
+    except (OSError, ValueError) as error:
+        raise PipelineError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
+    # A name as another system writes it: with its separators, from "./" on, or its accents apart.
+    known = {_plain(name): name for name in names} | {name: name for name in names}
+    pairs = dict[frozenset[str], tuple[str, str]]()
     for number, line in enumerate(lines, 1):
         words = [word.strip() for word in line.split("\t")] if "\t" in line else line.split()
         if not words or words[0].startswith("#"):
             continue
-        if len(words) != 2 or words[0] == words[1]:
+        found = [known.get(word) or known.get(_plain(word)) for word in words]
+        if len(words) != 2 or words[0] == words[1] or (found[0] == found[1] and None not in found):
             raise PipelineError(f"{path}:{number}: expected two names of images, got {line.strip()!r}")
-        for word in words:
-            if word not in known:
+        for word, name in zip(words, found):
+            if name is None:
                 raise PipelineError(f"{path}:{number}: {word} is not in {folder}")
+        words = [name for name in found if name is not None]
         pairs.setdefault(frozenset(words), (words[0], words[1]))
     return list(pairs.values())
 
 
+def _plain(name: str) -> str:
+    return unicodedata.normalize("NFC", name.replace("\\", "/").removeprefix("./"))
+
+
 @dataclass(frozen=True)
 class FolderSource:
-    """Pairs of images whose features lie in a cache.
+    """Pairs of images whose features lie in a cache; everything is in pixels of the images as they are shown.
 
     Attributes:
-        K: (3, 3) intrinsics of the images of ``K_size`` (width, height), all others are matched without; or None.
+        K: (3, 3) intrinsics of the images of ``K_size`` (width, height), as they are shown or as they are stored; all
+            others are matched without; or None.
         exif: without ``K``, take the intrinsics that the EXIF of each image gives.
     """
 
@@ -99,12 +110,21 @@ class FolderSource:
 
     def features(self, name: str) -> ImageFeatures | None:
         """Features from the cache, with the intrinsics that the image is matched with."""
-        features = self.cache.read(name)
-        if features is None:
+        features, shape = self.cache.read(name), self.cache.shape(name)
+        if features is None or shape is None:
             return None
         if self.K is None:
             return features if self.exif else replace(features, K=None)
-        return replace(features, K=self.K if features.image_size == self.K_size else None)
+        return replace(features, K=None if self.K_size is None else intrinsics_as_shown(self.K, self.K_size, *shape))
+
+    def stored(self, name: str) -> ImageFeatures | None:
+        """The same in the pixels of the file."""
+        features, shape = self.features(name), self.cache.shape(name)
+        return None if features is None or shape is None else stored_features(features, shape[1])
+
+    def stored_rows(self, rows: Iterable[PairRow]) -> Iterator[PairRow]:
+        """Rows of pairs between the pixels of the files."""
+        return (stored_row(row, self.cache.shape(row.name1), self.cache.shape(row.name2)) for row in rows)
 
     def image(self, name: str) -> ImageFeatures | Unusable:
         """The features, or why there are none."""
@@ -116,25 +136,24 @@ class FolderSource:
 
 
 def camera_size(
-    K: NDArray[np.float64], sizes: Mapping[str, tuple[int, int]]
+    K: NDArray[np.float64], shapes: Mapping[str, tuple[tuple[int, int], int]]
 ) -> tuple[tuple[int, int] | None, list[str]]:
     """The size (width, height) that one K (3, 3) is taken to belong to, the commonest of the images', and what is odd.
 
     Args:
-        sizes: (width, height) of the images by name.
+        shapes: (width, height) as it is shown, and EXIF orientation, of each image by name.
 
     Returns:
         The size, None without images; and lines that name the images of other sizes, and say where the principal point
         is far from the middle.
     """
-    if not sizes:
+    size = size_of_intrinsics(K, shapes.values())
+    if size is None:
         return None, []
-    counts = Counter(sizes.values())
-    size = max(counts, key=lambda each: (counts[each], each))
     doubts = []
-    others = sorted(name for name, other in sizes.items() if other != size)
+    others = sorted(name for name, shape in shapes.items() if intrinsics_as_shown(K, size, *shape) is None)
     if others:
-        few = ", ".join(f"{name} ({sizes[name][0]} x {sizes[name][1]})" for name in others[:3])
+        few = ", ".join(f"{name} ({shapes[name][0][0]} x {shapes[name][0][1]})" for name in others[:3])
         more = f" and {len(others) - 3} more" if len(others) > 3 else ""
         doubts.append(f"one K is that of one size, here {size[0]} x {size[1]}: matched without it: {few}{more}")
     far = principal_point_doubt(K, size)
@@ -143,14 +162,14 @@ def camera_size(
 
 @dataclass(frozen=True)
 class FolderJob:
-    """Images in, matches out.
+    """Images in, matches out: COLMAP's and hloc's in pixels of the files, JSON lines in pixels as EXIF has them shown.
 
     Attributes:
         images: the folder. pairs: names of images, relative to it.
         output: ``.db`` (COLMAP), ``.h5`` (hloc's matches; its features lie beside it as ``NAME.features.h5``) or
             ``.jsonl`` (one object per pair).
-        K: (3, 3) intrinsics of the images, in pixels, or None: they are those of ``exif``, or guessed. Images of
-            another size than most are matched without.
+        K: (3, 3) intrinsics of the images, in pixels, as they are shown or as they are stored, or None: they are those
+            of ``exif``, or guessed. Images of another size than most are matched without.
         detector, max_keypoints: as in :func:`mgca_filter.match_images`.
         cache: folder that keeps the features for other runs, or None: beside the output until the run is done.
         report: an HTML report of the run, or None.
@@ -185,7 +204,7 @@ class FolderJob:
             cache.fill(names, workers, quiet)
             source, doubts = self._source(cache, names)
             summary = run_pairs(source, workers, journal, quiet)
-            self._write(names, source.features, self._rows(journal))
+            self._write(names, source, self._rows(journal))
             if self.report is not None:
                 self.report.write(self._rows(journal))
         finally:
@@ -197,8 +216,8 @@ class FolderJob:
         """The pairs with their intrinsics, and what is odd about these."""
         if self.K is None:
             return FolderSource(cache, self.pairs, exif=self.exif), []
-        sizes = {name: size for name in names if (size := cache.size(name)) is not None}
-        size, doubts = camera_size(self.K, sizes)
+        shapes = {name: shape for name in names if (shape := cache.shape(name)) is not None}
+        size, doubts = camera_size(self.K, shapes)
         return FolderSource(cache, self.pairs, self.K, size), doubts
 
     def _rows(self, journal: Journal) -> Iterator[PairRow]:
@@ -206,20 +225,21 @@ class FolderJob:
         wanted = set(self.pairs)
         return (row for row in journal.rows() if (row.name1, row.name2) in wanted)
 
-    def _write(self, names: Sequence[str], read: ReadFeatures, rows: Iterable[PairRow]) -> None:
+    def _write(self, names: Sequence[str], source: FolderSource, rows: Iterable[PairRow]) -> None:
         with output_file(self.output) as partial:
             if self.output.suffix == ".db":
                 from .colmap import write_database
 
-                write_database(partial, names, read, rows, "SIMPLE_RADIAL" if self.K is None else "PINHOLE")
+                camera_model = "SIMPLE_RADIAL" if self.K is None else "PINHOLE"
+                write_database(partial, names, source.stored, source.stored_rows(rows), camera_model)
             elif self.output.suffix == ".h5":
                 from .hloc import write_features, write_matches
 
                 with output_file(self.output.with_suffix(".features.h5")) as partial_features:
-                    write_features(partial_features, names, read)
-                write_matches(partial, read, rows)
+                    write_features(partial_features, names, source.stored)
+                write_matches(partial, source.stored, rows)
             else:
-                write_json_lines(partial, read, rows)
+                write_json_lines(partial, source.features, rows)
 
 
 def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) -> None:
@@ -227,7 +247,8 @@ def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) ->
 
     Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``, ``E``,
     ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
-    ``scores`` (K,) of the kept matches, ``message`` for a pair that failed.
+    ``scores`` (K,) of the kept matches, ``message`` for a pair that failed. Pixels, and the geometry between them, are
+    those of the photographs as their EXIF says that they are to be shown.
     """
     with path.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(document, allow_nan=False) + "\n" for document in _documents(read, rows))

@@ -25,7 +25,8 @@ from ..features import (
     keypoint_attributes,
     match_descriptors,
 )
-from ..images import decode_image
+from ..geometry.orientation import UPRIGHT
+from ..images import decode_photo
 from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
@@ -147,18 +148,21 @@ class PairWorker:
         # Without intrinsics, or with such as the matches contradict, F tells the matches apart.
         return self._filter.filter_many([pair])[0], pairs
 
-    def extract(self, name: str, encoded: bytes, detector: str, max_keypoints: int) -> tuple[str, ImageFeatures | None]:
-        """Features of an image file's bytes, in pixels as stored (COLMAP and hloc ignore EXIF orientation too), and K
-        where its EXIF knows the focal length.
+    def extract(
+        self, name: str, encoded: bytes, detector: str, max_keypoints: int
+    ) -> tuple[str, ImageFeatures | None, int]:
+        """Features of an image file's bytes, in pixels of the image as it is shown, K where its EXIF knows the focal
+        length, and the EXIF orientation that leads back to the pixels as they are stored.
 
         None in place of the features of a file that cannot be decoded.
         """
         try:
-            image = decode_image(encoded, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+            image, orientation = decode_photo(encoded)
         except ValueError:
-            return name, None
+            return name, None, UPRIGHT
         features = describe(image, create_detector(detector, max_keypoints))
-        return name, replace(features, K=exif_intrinsics(encoded, (image.shape[1], image.shape[0])))
+        K = exif_intrinsics(encoded, (image.shape[1], image.shape[0]))
+        return name, replace(features, K=K), orientation
 
 
 def call_worker(filter_options: str, method: str, task: tuple[Any, ...]) -> Any:

@@ -20,7 +20,7 @@ from mgca_filter.inputs.options import FilterOptions
 
 IMAGES = ROOT / "examples" / "images"
 LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
-COMMANDS = ("colmap", "hloc", "folder", "run")
+COMMANDS = ("colmap", "hloc", "folder", "run", "train", "evaluate")
 
 
 def help_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
@@ -38,10 +38,32 @@ def test_the_usage_names_every_command(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_help_says_whether_photos_are_turned(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, expected in (([], "turned first"), (["folder"], "does\nnot turn photos as their EXIF says")):
+    for words, expected in (([], "turned first"), (["folder"], "turned\nback to the pixels of the files")):
         text = help_of(capsys, *words)
         assert expected in text
-        assert "--K is for the" in text
+        assert "--K is for the photo" in text
+
+
+@pytest.mark.parametrize(
+    ("word", "package", "extra"), [("train", "training", "train"), ("evaluate", "evaluation", "eval")]
+)
+def test_siblings_tell_which_extra_is_missing(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], word: str, package: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, f"mgca_filter.{package}.__main__", None)
+    assert cli.main([word]) == 2
+    assert_one_line(capsys.readouterr(), f"'mgca_filter[{extra}]'")
+
+
+def test_run_has_the_options_of_a_command_before_the_script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["run", str(tmp_path / "none.py")]) == 2
+    assert_one_line(capsys.readouterr(), f"mgca-match: {tmp_path / 'none.py'}: no such file")
+    assert cli.main(["run", "--providers", "abacus", "x.py"]) == 2
+    assert_one_line(capsys.readouterr(), "mgca-match run --help")
+    (tmp_path / "script.py").write_text("import os, sys; print(os.environ['MGCA_FILTER_PROVIDERS'], sys.argv[1:])")
+    process = start_command("run", "--providers", "cpu", "script.py", "--providers", "mine", cwd=tmp_path)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (0, "CPUExecutionProvider ['--providers', 'mine']\n"), err
 
 
 def test_run_is_a_word_of_the_command_as_well(tmp_path: Path) -> None:

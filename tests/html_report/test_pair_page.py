@@ -27,18 +27,18 @@ def result(model_file) -> FilterResult:
 
 
 @pytest.fixture(scope="module")
-def rival() -> np.ndarray:
+def baseline() -> np.ndarray:
     return np.random.default_rng(5).random(120) < 0.5
 
 
 @pytest.fixture(scope="module")
-def report(tmp_path_factory, result, rival):
+def report(tmp_path_factory, result, baseline):
     """A report with everything in it, of smooth random images."""
     noise = [np.random.default_rng(seed).integers(0, 256, (SIZE[1], SIZE[0], 3), dtype=np.uint8) for seed in (0, 1)]
     images = [cv2.GaussianBlur(image, (9, 9), 3) for image in noise]
     path = tmp_path_factory.mktemp("report") / "pair.html"
     return write_pair_report(
-        path, *images, result, name1="one.jpg", name2=NAME, baselines=[Baseline("RANSAC", rival)], K1=K,
+        path, *images, result, name1="one.jpg", name2=NAME, baselines=[Baseline("RANSAC", baseline)], K1=K,
         truth=Truth(R=SCENE.R, t=SCENE.t), matches=SCENE.knn_matches(),
     )  # fmt: skip
 
@@ -156,18 +156,18 @@ def test_wheel_and_drag_move_the_image_under_the_pointer(seen):
     assert seen["pin"] == -1
 
 
-def test_comparison_counts_who_keeps_what(seen, result, rival):
+def test_comparison_counts_who_keeps_what(seen, result, baseline):
     seen = seen["comparison"]
     tally = {name: sum(counts) for name, counts in seen["tally"].items()}
     assert tally == {
-        "both": np.count_nonzero(result.mask & rival),
-        "ours": np.count_nonzero(result.mask & ~rival),
-        "theirs": np.count_nonzero(~result.mask & rival),
-        "neither": np.count_nonzero(~result.mask & ~rival),
+        "both": np.count_nonzero(result.mask & baseline),
+        "ours": np.count_nonzero(result.mask & ~baseline),
+        "theirs": np.count_nonzero(~result.mask & baseline),
+        "neither": np.count_nonzero(~result.mask & ~baseline),
     }
     assert seen["groups"] == {"both": False, "ours": True, "theirs": True, "neither": False}
     assert seen["only"]
-    kept = [str(result.num_inliers), str(np.count_nonzero(rival))]
+    kept = [str(result.num_inliers), str(np.count_nonzero(baseline))]
     assert [cells[:2] for cells in seen["cells"]] == [["mgca_filter", kept[0]], ["RANSAC", kept[1]]]
 
 

@@ -339,3 +339,14 @@ def test_missing_provider_falls_back_with_one_warning(model_file: Path, provider
         backend = OnnxBackend(model_file, providers)
     assert len(caught) == 1
     assert backend.infer(*random_input(5))[0].shape == (2, 5)
+
+
+def test_the_environment_says_which_providers_run_where_the_caller_does_not(
+    model_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MGCA_FILTER_PROVIDERS", "NoSuchProvider,CPUExecutionProvider")
+    with pytest.warns(RuntimeWarning, match="NoSuchProvider"):
+        OnnxBackend(model_file)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        OnnxBackend(model_file, ["CPUExecutionProvider"])

@@ -18,13 +18,18 @@ import numpy as np
 import pytest
 from conftest import METADATA, build_model
 from exif_files import FOCAL_35MM, with_exif
+from image_files import turned
 from pipeline_command import K_WORDS, ROOT, assert_one_line, start_command
 
 from mgca_filter import cli, match_images
 from mgca_filter.features import create_detector, describe
-from mgca_filter.geometry.epipolar import pose_error_deg
+from mgca_filter.geometry.epipolar import pose_error_deg, sampson_distance
 from mgca_filter.html_report import write_folder_report
-from mgca_filter.pipelines.folder import FolderJob, exhaustive_pairs, sequential_pairs
+from mgca_filter.images import intrinsics_as_shown
+from mgca_filter.pipelines.folder import FolderJob, camera_size, exhaustive_pairs, read_pairs, sequential_pairs
+from mgca_filter.pipelines.journal import PipelineError
+from mgca_filter.pipelines.stored_pixels import stored_row
+from mgca_filter.pipelines.worker import PairRow
 
 # A quarter of the default: the laws are about the run, not about the matches.
 KEYPOINTS = 1000
@@ -467,3 +472,102 @@ def test_a_folder_is_matched_with_the_defaults_of_match_images():
     alone = signature(match_images).parameters
     assert [job[name] for name in ("detector", "max_keypoints")] == ["rootsift", 4000]
     assert [alone[name].default for name in ("detector", "max_keypoints")] == ["rootsift", 4000]
+
+
+@pytest.fixture
+def held_sideways(tmp_path, views):
+    """Two views as files, upright, and as a camera stores them that was held sideways for the second."""
+    folders = tmp_path / "upright", tmp_path / "sideways"
+    for folder, orientations in zip(folders, ((1, 1), (1, 6))):
+        folder.mkdir()
+        for number, (view, orientation) in enumerate(zip(views, orientations)):
+            stored = view.image if orientation == 1 else cv2.rotate(view.image, cv2.ROTATE_90_COUNTERCLOCKWISE)
+            (folder / f"{number}.png").write_bytes(turned(".png", stored, orientation))
+    return folders
+
+
+def test_photos_are_matched_as_they_are_shown(held_sideways, tmp_path):
+    """As by ``mgca-match img1 img2``, with the same K for the two."""
+    rows = []
+    for folder in held_sideways:
+        assert run(folder, tmp_path / f"{folder.name}.jsonl", "--max-keypoints", 1000) == 0
+        rows += read_rows(tmp_path / f"{folder.name}.jsonl")
+    assert rows[0]["status"] == "ok"
+    assert rows[0]["calibrated"]
+    assert rows[0] == rows[1]
+
+
+def test_what_colmap_and_hloc_get_is_in_the_pixels_of_the_files(held_sideways, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    for folder in held_sideways:
+        assert run(folder, tmp_path / f"{folder.name}.db", "--max-keypoints", 1000) == 0
+        assert run(folder, tmp_path / f"{folder.name}.h5", "--max-keypoints", 1000) == 0
+    answers = []
+    for folder in held_sideways:
+        with contextlib.closing(pycolmap.Database.open(tmp_path / f"{folder.name}.db")) as database:
+            tables = [database.read_keypoints(number) for number in (1, 2)]
+            answers.append((tables, database.read_two_view_geometry(1, 2), database.read_camera(2)))
+            read_by_colmap = pycolmap.Bitmap.read(folder / "1.png", False)
+            camera = database.read_camera(database.read_image(2).camera_id)
+            assert (camera.width, camera.height) == (read_by_colmap.width, read_by_colmap.height)
+    (upright, geometry, _), (sideways, turned_geometry, camera) = answers
+    np.testing.assert_allclose(sideways[0], upright[0], atol=1e-3)
+    # A quarter turn clockwise shows the stored pixel (x, y) at (height - y, x), in COLMAP's pixels.
+    np.testing.assert_allclose(
+        sideways[1][:, :2], np.column_stack([upright[1][:, 1], 640 - upright[1][:, 0]]), atol=1e-3
+    )
+    np.testing.assert_allclose(camera.params, [512, 512, 240, 320], atol=1e-9)
+    np.testing.assert_array_equal(turned_geometry.inlier_matches, geometry.inlier_matches)
+    kept = geometry.inlier_matches
+    points1, points2 = sideways[0][kept[:, 0], :2], sideways[1][kept[:, 1], :2]
+    assert sampson_distance(np.hstack([points1, points2]), turned_geometry.F).max() < 1.1
+    # The turned camera sees every point turned with it, about its own axis.
+    S = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    R = turned_geometry.cam2_from_cam1.rotation.matrix()
+    np.testing.assert_allclose(S @ R, geometry.cam2_from_cam1.rotation.matrix(), atol=1e-9)
+    with h5py.File(tmp_path / "sideways.features.h5") as file:
+        np.testing.assert_allclose(file["1.png/keypoints"][()] + 0.5, sideways[1][:, :2], atol=1e-3)
+        assert file["1.png/image_size"][()].tolist() == [480, 640]
+
+
+def test_one_K_is_for_photos_as_they_are_shown_or_as_they_are_stored():
+    landscape, portrait = camera(319.5, 239.5), camera(239.5, 319.5)
+    upright, sideways = ((640, 480), 1), ((480, 640), 6)
+    for K, photos, size in (
+        (landscape, [upright, sideways], (640, 480)),
+        (landscape, [sideways], (640, 480)),
+        (portrait, [sideways], (480, 640)),
+        (landscape, [upright], (640, 480)),
+    ):
+        assert camera_size(K, dict(enumerate(photos))) == (size, [])
+    np.testing.assert_allclose(intrinsics_as_shown(landscape, (640, 480), *sideways), portrait)
+    np.testing.assert_array_equal(intrinsics_as_shown(portrait, (480, 640), *sideways), portrait)
+    assert intrinsics_as_shown(landscape, (640, 480), (480, 640), 1) is None
+    assert intrinsics_as_shown(landscape, (640, 480), (480, 640), 3) is None
+
+
+def camera(cx, cy):
+    return np.array([[512, 0, cx], [0, 512, cy], [0, 0, 1.0]])
+
+
+def test_a_mirrored_file_has_no_rotation_to_its_neighbour():
+    row = PairRow("a", "b", "ok", 9, np.zeros((0, 2), np.uint32), np.zeros(0, np.float32), R=np.eye(3), t=np.eye(3)[0])
+    upright, mirrored = ((640, 480), 1), ((640, 480), 2)
+    assert stored_row(row, upright, upright) is row
+    for shapes in ((upright, mirrored), (mirrored, upright)):
+        assert stored_row(row, *shapes).R is None
+        assert stored_row(row, *shapes).t is None
+    np.testing.assert_array_equal(stored_row(row, mirrored, mirrored).R, np.eye(3))
+    np.testing.assert_array_equal(stored_row(row, mirrored, mirrored).t, [-1, 0, 0])
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_pair_lists_as_other_systems_write_them(tmp_path, encoding):
+    """Encodings and line ends; separators; names from "./" on; accents apart, as macOS writes them."""
+    names = ["b\u00fcro/a.png", "b.png", "c.png"]
+    lines = ["bu\u0308ro\\a.png b.png", "./c.png ./b.png", "b.png c.png", ""]
+    (tmp_path / "pairs.txt").write_bytes("\r\n".join(lines).encode(encoding))
+    assert read_pairs(tmp_path / "pairs.txt", names, tmp_path) == [(names[0], "b.png"), ("c.png", "b.png")]
+    (tmp_path / "pairs.txt").write_text("b.png ./b.png\n")
+    with pytest.raises(PipelineError, match="expected two names"):
+        read_pairs(tmp_path / "pairs.txt", names, tmp_path)
