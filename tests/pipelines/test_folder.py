@@ -571,3 +571,40 @@ def test_pair_lists_as_other_systems_write_them(tmp_path, encoding):
     (tmp_path / "pairs.txt").write_text("b.png ./b.png\n")
     with pytest.raises(PipelineError, match="expected two names"):
         read_pairs(tmp_path / "pairs.txt", names, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("1 OPENCV 640 480 512 512 320 240 0.1 0 0 0\n", "has lens distortion"),
+        ("1 PINHOLE 640 480 512 512 320 240\n2 PINHOLE 640 480 500 500 320 240\n", "holds 2 cameras"),
+    ],
+)
+def test_a_camera_that_the_command_cannot_use_is_told_before_the_work(image_folder, tmp_path, capsys, content, words):
+    (tmp_path / "cameras.txt").write_text(content)
+    arguments = ["folder", str(image_folder), "-o", str(tmp_path / "o.jsonl"), "--K", str(tmp_path / "cameras.txt")]
+    assert cli.main(arguments) == 2
+    assert_one_line(capsys.readouterr(), words)
+    assert sorted(path.name for path in tmp_path.iterdir() if path.suffix == ".work") == []
+
+
+def test_K_from_a_file_is_that_of_the_numbers(image_folder, tmp_path, monkeypatch):
+    (tmp_path / "cameras.txt").write_text("1 PINHOLE 640 480 512 512 320 240\n")
+    jobs = []
+    monkeypatch.setattr(FolderJob, "run", lambda job, *arguments: jobs.append(job) or pytest.fail("seen enough"))
+    for K in (K_WORDS, str(tmp_path / "cameras.txt")):
+        with pytest.raises(pytest.fail.Exception, match="seen enough"):
+            cli.main(["folder", str(image_folder), "-o", str(tmp_path / "o.jsonl"), "--K", K])
+    np.testing.assert_array_equal(jobs[0].K, jobs[1].K)
+
+
+def test_options_that_make_no_sense_are_told(image_folder, tmp_path, capsys):
+    (tmp_path / "none.txt").touch()
+    words = ["folder", str(image_folder), "-o", str(tmp_path / "o.jsonl"), "--pairs", str(tmp_path / "none.txt")]
+    for quiet, count in (([], 3), (["-q"], 1)):
+        assert cli.main([*words, "--K", K_WORDS, "--overlap", "3", "--no-exif", *quiet]) == 2
+        lines = capsys.readouterr().err.splitlines()
+        assert len(lines) == count
+        assert lines[-1].endswith("no pairs to match")
+    assert cli.main(words) == 2
+    assert_one_line(capsys.readouterr(), "no pairs")
