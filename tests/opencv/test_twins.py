@@ -280,7 +280,7 @@ def test_a_rotation_keeps_its_matches_and_a_matrix_to_hand_on() -> None:
     assert rotation_error_deg(R, turned.R) < 1.0
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_standing_camera_does_not_stop_an_unchanged_script(seed: int) -> None:
     rng = np.random.default_rng(seed)
     before = rng.uniform((0, 0), (640, 480), (500, 2)).astype(np.float32)
