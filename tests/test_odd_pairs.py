@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import SIZE, K, make_scene
 
-from mgca_filter import MatchFilter, Status, match_images
+from mgca_filter import MatchFilter, Status, match_images, patch_cv2
 from mgca_filter.fit.mirror import share_of_turned_triangles
 from mgca_filter.geometry.epipolar import rotation_error_deg
 from mgca_filter.verdict_text import describe_verdict
@@ -124,3 +124,18 @@ def test_a_mirrored_scene_with_depth_has_no_usable_pose(match_filter: MatchFilte
 def test_the_words_for_a_mirrored_image() -> None:
     assert "mirrored" in describe_verdict("planar", mirrored=True).advice
     assert "mirrored" not in describe_verdict("planar").advice
+
+
+@pytest.mark.parametrize(("count", "noise_px"), [(300, 0.0), (300, 0.2), (8, 0.1), (5, 0.1)])
+def test_a_script_goes_on_where_nothing_moved(count: int, noise_px: float) -> None:
+    """Odometry over frames of a standing camera: a matrix comes back, and ``recoverPose`` finds no turn in it."""
+    rng = np.random.default_rng(count)
+    points1 = rng.uniform((0, 0), SIZE, (count, 2))
+    points2 = points1 + rng.normal(0, noise_px, points1.shape) if noise_px else points1.copy()
+    with patch_cv2():
+        E, mask = cv2.findEssentialMat(points1, points2, K, cv2.RANSAC, 0.999, 1.0)
+        assert E.shape == (3, 3)
+        assert mask.shape == (count, 1)
+        _, R, t, _ = cv2.recoverPose(E, points1, points2, K, mask=mask)
+    assert rotation_error_deg(R, np.eye(3)) < 0.5
+    assert np.linalg.norm(t) == pytest.approx(1.0)

@@ -8,8 +8,19 @@ namespace mgca::detail {
 namespace {
 
 constexpr std::size_t kMaxNetworkMatches = 8000;
-// Rejected matches stay this far below the decision threshold, whatever the prior says.
+// Rejected matches stay this far below the decision threshold, whatever the prior says; over the last part of the way
+// their logits are compressed, so that no two that the prior tells apart come out alike.
 constexpr double kRejectedMargin = 1e-3;
+constexpr double kCompressed = 0.25;
+
+/// A logit below a ceiling: as it is far below it, in the same order near it and above.
+float below(double logit, double ceiling) {
+    const double above = logit - (ceiling - kCompressed);
+    if (above <= 0.0) {
+        return static_cast<float>(logit);
+    }
+    return static_cast<float>(ceiling - kCompressed * kCompressed / (kCompressed + above));
+}
 
 }  // namespace
 
@@ -57,10 +68,10 @@ std::optional<NetworkOutput> run_network(const Network& network, const PairInput
 std::vector<float> assemble_logits(const PairInput& pair, const Rows& sent, const std::optional<NetworkOutput>& output,
                                    const ModelMetadata& metadata) {
     std::vector<float> logits(pair.valid.size(), kInvalidLogit);
-    const auto ceiling = static_cast<float>(metadata.decision_threshold - kRejectedMargin);
+    const double ceiling = metadata.decision_threshold - kRejectedMargin;
     for (std::size_t i = 0; i < logits.size(); ++i) {
         if (pair.valid[i] != 0) {
-            logits[i] = std::min(metadata.prior.logit(pair.attributes[i]), ceiling);
+            logits[i] = below(metadata.prior.logit(pair.attributes[i]), ceiling);
         }
     }
     for (std::size_t k = 0; output && k < sent.size(); ++k) {

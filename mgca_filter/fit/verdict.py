@@ -98,7 +98,8 @@ def judge(
     if withheld and not suspicious:
         unrelated = Verdict(Status.UNRELATED, nothing, info=info)
         return _plane_or(unrelated, pair, evidence, mask_threshold_px, options)
-    noise = max(float(np.median(sampson_distance(inliers, model.M))), degeneracy.LEAST_NOISE_PX / pair.focal_px)
+    residual = float(np.median(sampson_distance(inliers, model.M)))
+    noise = max(degeneracy.TO_SIGMA * residual, degeneracy.LEAST_NOISE_PX / pair.focal_px)
     info["translation_sigma_deg"] = direction_uncertainty_deg(inliers, model.R, model.t, noise)
     verdict = _keep_model(pair, model, mask_threshold_px, info)
     if suspicious:

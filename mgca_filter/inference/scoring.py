@@ -14,8 +14,10 @@ from . import Backend
 MAX_NETWORK_MATCHES = 8000
 # Logit of a match without usable coordinates: low enough for a probability of zero under any calibration.
 INVALID_LOGIT = -100.0
-# Rejected matches stay this far below the decision threshold, whatever the prior says.
+# Rejected matches stay this far below the decision threshold, whatever the prior says; over the last part of the way
+# their logits are compressed, so that no two that the prior tells apart come out alike.
 _REJECTED_MARGIN = 1e-3
+_COMPRESSED = 0.25
 
 
 @dataclass(frozen=True)
@@ -94,8 +96,16 @@ def assemble_logits(
     metadata = backend.metadata
     ceiling = metadata.decision_threshold - _REJECTED_MARGIN
     logits = np.full(len(valid), INVALID_LOGIT, dtype=np.float32)
-    logits[valid] = np.minimum(metadata.prior.logits(attributes[valid]), ceiling)
+    logits[valid] = _below(metadata.prior.logits(attributes[valid]), ceiling)
     if output is not None:
         # Degenerate input (all points equal, say) may leave the network without a finite answer.
         logits[sent.rows] = np.where(np.isfinite(output.logits), output.logits, INVALID_LOGIT)
     return logits
+
+
+def _below(logits: NDArray[np.float32], ceiling: float) -> NDArray[np.float32]:
+    """Logits (N,) in their order, all below ``ceiling``; those far below it as they are."""
+    knee = ceiling - _COMPRESSED
+    above = np.maximum(logits.astype(np.float64) - knee, 0.0)
+    compressed = ceiling - _COMPRESSED**2 / (_COMPRESSED + above)
+    return np.where(above > 0.0, compressed, logits).astype(np.float32)
