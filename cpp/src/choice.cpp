@@ -252,11 +252,10 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     const std::vector<double> counts = independent_counts(matches, weights, coefficients);
     const auto plain_by_scale = log_likelihoods(residuals, std::vector<double>(count, share), coefficients, counts);
     auto by_scale = plain_by_scale;
+    std::vector<double> probability(count, share);
     if (scores) {
-        std::vector<double> probability;
-        for (const double score : weights) {
-            probability.push_back(score_prior(score, coefficients));
-        }
+        std::transform(weights.begin(), weights.end(), probability.begin(),
+                       [&](double score) { return score_prior(score, coefficients); });
         by_scale = log_likelihoods(residuals, probability, coefficients, counts);
     }
     // One scale for all hypotheses: that of the most likely one.
@@ -272,17 +271,28 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         likelihood.push_back(by_scale[h][column]);
         plain.push_back(plain_by_scale[h][column]);
     }
-    std::vector<double> merit = likelihood;
+    const auto whole_by_scale =
+        log_likelihoods(residuals, probability, coefficients, std::vector<double>(count, 1.0));
+    std::vector<double> merit = likelihood, whole_merit;
     std::vector<double> counted = weights;
     for (std::size_t i = 0; i < count; ++i) {
         counted[i] *= counts[i];
     }
     const std::vector<double> relative = log_relative_support(residuals, counted);
+    const std::vector<double> whole_relative = log_relative_support(residuals, weights);
     const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(count), 1.5);
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
         merit[h] += factor * relative[h];
+        whole_merit.push_back(whole_by_scale[h][column] + factor * whole_relative[h]);
     }
-    const std::size_t chosen = position_of_largest(merit);
+    // Crowded matches count less for one answer against another; of hypotheses of one answer all matches tell the best.
+    const std::size_t answer = position_of_largest(merit);
+    for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
+        if (!(pose_angle_deg(hypotheses[h].pose, hypotheses[answer].pose) < kAlternativeDeg)) {
+            whole_merit[h] = -std::numeric_limits<double>::infinity();
+        }
+    }
+    const std::size_t chosen = position_of_largest(whole_merit);
     const std::vector<double> support = supports(residuals, weights, 1.0);
 
     std::vector<double> angles;

@@ -205,14 +205,19 @@ def independent_counts(correspondences: Array, weights: Array, coefficients: Coe
     return np.asarray(np.maximum(np.bincount(cell, weights), 1.0)[cell] ** -power)
 
 
+def _angles_to(hypotheses: Hypotheses, one: int) -> Array:
+    """Angles (H,) of all hypotheses to one of them, degrees."""
+    return pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[one]], hypotheses.t[[one]])[:, 0]
+
+
 def log_likelihoods(
     residuals: Residuals, probability: Array, coefficients: Coefficients, counts: Array | None = None
 ) -> Array:
-    """Log-likelihood ratios (H, S) against all matches being wrong, for each scale of the noise.
+    """Log-likelihood ratios (H, S) against all matches being wrong, for each scale of the noise; (H, S, K) of K counts.
 
     Args:
         probability: (N,) that a match is right, below 1.
-        counts: (N,) what each match counts (:func:`independent_counts`); None = 1.
+        counts: (N,) or (N, K) what each match counts (:func:`independent_counts`); None = 1.
         coefficients: ``noise_px`` and ``noise_weights`` of the mixture, ``noise_scales``, ``outlier_width_px``: the
             width across which a wrong match may lie; ``seen_behind``: share of right matches that lie behind a camera
             all the same, because they are off *along* their epipolar line, as in a corridor walked down.
@@ -276,15 +281,22 @@ def judge(
     share = float(np.clip(inliers.max() / max(count, 1), MIN_SHARE, MAX_SHARE))
     weights = np.full(count, share) if scores is None else scores
     counts = independent_counts(correspondences, weights, coefficients)
-    by_scale = plain_by_scale = log_likelihoods(residuals, np.full(count, share), coefficients, counts)
+    both_counts = np.stack([counts, np.ones(count)], axis=1)
+    of_both = log_likelihoods(residuals, np.full(count, share), coefficients, both_counts)
+    plain_by_scale = of_both[:, :, 0]
     if scores is not None:
-        by_scale = log_likelihoods(residuals, prior(scores, coefficients), coefficients, counts)
+        of_both = log_likelihoods(residuals, prior(scores, coefficients), coefficients, both_counts)
+    by_scale = of_both[:, :, 0]
     # One scale for all hypotheses: that of the most likely one.
     column = int(np.argmax(by_scale.max(axis=0)))
     likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
-    chosen = int(np.argmax(likelihood + _support_bonus(residuals, weights * counts, coefficients)))
+    answer = int(np.argmax(likelihood + _support_bonus(residuals, weights * counts, coefficients)))
+    # Crowded matches count less for one answer against another; of hypotheses of one answer all matches tell the best.
+    alike = _angles_to(hypotheses, answer) < ALTERNATIVE_DEG
+    whole = of_both[:, column, 1] + _support_bonus(residuals, weights, coefficients)
+    chosen = int(np.argmax(np.where(alike, whole, -np.inf)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
-    angles = pairwise_angles_deg(hypotheses.R, hypotheses.t, hypotheses.R[[chosen]], hypotheses.t[[chosen]])[:, 0]
+    angles = _angles_to(hypotheses, chosen)
     alternatives = angles > ALTERNATIVE_DEG
 
     def gap(values: Array) -> float:
