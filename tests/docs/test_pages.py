@@ -56,6 +56,8 @@ SLOW = {
     "pipelines/ray.md",
     "training.md",
 }
+ELSEWHERE = {"cpp.md"}
+"""Pages whose blocks need the built C++ library: tests/test_cpp.py builds and uses it."""
 # The package and the interpreter from here, under the names that users type.
 PREAMBLE = f"""set -euo pipefail
 python() {{ "{sys.executable}" "$@"; }}
@@ -84,6 +86,8 @@ def read_blocks(page: str) -> list[Block]:
 
 
 def runnable(page: str) -> list[Block]:
+    if page in ELSEWHERE:
+        return []
     return [block for block in read_blocks(page) if block.language in ("bash", "python", "text") and block.run]
 
 
