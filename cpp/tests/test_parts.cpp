@@ -219,7 +219,8 @@ Coefficients coefficients() {
     return Coefficients::read(Json::parse(R"({
         "score_trust": [0.8, 0.5, 0.05], "noise_px": [0.25, 0.6, 1.5], "noise_weights": [0.4, 0.4, 0.2],
         "noise_scales": [1.0, 1.7], "outlier_width_px": [300], "seen_behind": [0.02],
-        "support_weight": [0.1], "early_end": [0.5, 50, 0.03, 0.5, 20], "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
+        "support_weight": [0.1], "crowding": [0.15, 0.5], "early_end": [0.5, 50, 0.03, 0.5, 20],
+        "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
         "confidence": [1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0], "early_confidence": [0,0,0,0,0,0,1]})"));
 }
 
