@@ -2,7 +2,7 @@
 
 ``python -m benchmarks.profile_network [MODEL.onnx] [--count 2000] [--threads 2]`` profiles ONNX Runtime node by node.
 The floor of a part is what its matrix products alone would take at the rate of a large product, measured in the same
-run.
+run. ``--scaling`` prints how time and memory grow with the number of matches instead.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import mgca_filter
 from mgca_filter.inference.backend import OUTPUT_NAMES
 from mgca_filter.tables import MISSING, render_table
 
-from .speed import network_input
+from .speed import network_input, run_alone
 
 # Parts by the names of their nodes, first match first; what ONNX Runtime fused carries its own name.
 PARTS = (
@@ -41,15 +41,33 @@ PARTS = (
     ("GELU (fused)", r"^Gelu"),
 )
 GEMM_SHAPE = (2000, 512, 512)
+SCALING_COUNTS, REFERENCE_COUNT = (500, 1000, 2000, 4000, 8000), 2000
+# Growth by a pass over few matches is left out: it is the same for all.
+MEMORY = """
+import re, sys
+import numpy as np, onnxruntime
+def peak_mib():
+    return int(re.search(r"VmHWM:\\s+(\\d+) kB", open("/proc/self/status").read())[1]) / 1024
+options = onnxruntime.SessionOptions()
+options.log_severity_level, options.intra_op_num_threads = 3, int(sys.argv[3])
+session, rng = onnxruntime.InferenceSession(sys.argv[1], options), np.random.default_rng(0)
+def run(count):
+    inputs = {"correspondences": 4, "attributes": 8}
+    session.run(None, {name: rng.random((1, count, width), dtype=np.float32) for name, width in inputs.items()})
+run(20)
+before = peak_mib()
+run(int(sys.argv[2]))
+print(peak_mib() - before)
+"""
 
 
 @dataclass
 class Cost:
-    """Of one part, over all runs: milliseconds, floating-point operations of matrix products, nodes."""
+    """Of one part, over all runs: milliseconds, floating-point operations of matrix products, kernels that ran."""
 
     ms: float = 0.0
     flops: float = 0.0
-    nodes: int = 0
+    kernels: int = 0
 
 
 def gemm_rate(threads: int, repeats: int = 15) -> float:
@@ -82,7 +100,7 @@ def session_options(threads: int) -> Any:
 
 
 def profile(model: Path, count: int, threads: int, repeats: int) -> tuple[list[dict[str, Any]], float]:
-    """Node events of ``repeats`` runs, and the median milliseconds of a run without profiling."""
+    """Kernel events of ``repeats`` runs, and the median milliseconds of a run without profiling."""
     inputs = dict(zip(("correspondences", "attributes"), network_input(count)))
     plain = onnxruntime.InferenceSession(str(model), session_options(threads))
     times = []
@@ -97,8 +115,9 @@ def profile(model: Path, count: int, threads: int, repeats: int) -> tuple[list[d
         for _ in range(repeats):
             session.run(OUTPUT_NAMES, inputs)
         events = json.loads(Path(session.end_profiling()).read_text())
-    nodes = [event for event in events if event.get("cat") == "Node" and event["name"].endswith("_kernel_time")]
-    return nodes, float(np.median(times[1:]))
+    kernels = [event for event in events if event.get("cat") == "Node" and event["name"].endswith("_kernel_time")]
+    # What a Loop takes is what its body takes, which is listed as well.
+    return [event for event in kernels if event["args"]["op_name"] != "Loop"], float(np.median(times[1:]))
 
 
 def product_flops(event: dict[str, Any]) -> float:
@@ -123,23 +142,50 @@ def costs(events: list[dict[str, Any]], repeats: int, by_part: bool) -> dict[str
         cost = total[part if by_part else event["args"]["op_name"]]
         cost.ms += event["dur"] / 1e3 / repeats
         cost.flops += product_flops(event) / repeats
-        cost.nodes += 1
+        cost.kernels += 1
     for cost in total.values():
-        cost.nodes //= repeats
+        cost.kernels //= repeats
     return dict(sorted(total.items(), key=lambda item: -item[1].ms))
 
 
 def print_costs(title: str, table: dict[str, Cost], rate: float) -> None:
     """Markdown: milliseconds, share, floor of the products, and how many times that floor."""
     total = sum(cost.ms for cost in table.values())
-    whole = Cost(total, sum(cost.flops for cost in table.values()), sum(cost.nodes for cost in table.values()))
+    whole = Cost(total, sum(cost.flops for cost in table.values()), sum(cost.kernels for cost in table.values()))
     body = []
     for name, cost in [*table.items(), ("all", whole)]:
         floor = cost.flops / rate
         times = f"{cost.ms / floor:.1f}" if floor > 0.01 * cost.ms else MISSING
         share = f"{100 * cost.ms / total:.0f} %"
-        body.append([name, str(cost.nodes), f"{cost.ms:.2f}", share, f"{floor:.2f}", times])
-    print("\n" + render_table([title, "nodes", "ms", "share", "floor, ms", "times the floor"], body))
+        body.append([name, str(cost.kernels), f"{cost.ms:.2f}", share, f"{floor:.2f}", times])
+    print("\n" + render_table([title, "kernels", "ms", "share", "floor, ms", "times the floor"], body))
+
+
+def print_scaling(model: Path, threads: int, repeats: int) -> None:
+    """Markdown: least milliseconds of a pass, all counts in turn, and the growth of a process of its own."""
+    session = onnxruntime.InferenceSession(str(model), session_options(threads))
+    inputs = {count: dict(zip(("correspondences", "attributes"), network_input(count))) for count in SCALING_COUNTS}
+    times: dict[int, list[float]] = {count: [] for count in SCALING_COUNTS}
+    for _ in range(repeats):
+        for count in SCALING_COUNTS:
+            started = time.perf_counter()
+            session.run(OUTPUT_NAMES, inputs[count])
+            times[count].append(1e3 * (time.perf_counter() - started))
+    memory = {count: run_alone(MEMORY, model, count, threads)[0] for count in SCALING_COUNTS}
+    least = {count: min(values) for count, values in times.items()}
+    base = REFERENCE_COUNT
+    body = [
+        [
+            str(n),
+            f"{least[n]:.1f}",
+            f"{least[n] / least[base]:.2f}",
+            f"{memory[n]:.0f}",
+            f"{memory[n] / memory[base]:.2f}",
+        ]
+        for n in SCALING_COUNTS
+    ]
+    print(f"Threads: {threads}; multiples of N = {base}.\n")
+    print(render_table(["N", "ms", "times", "MiB", "times"], body))
 
 
 def main() -> None:
@@ -150,7 +196,11 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=10)
     parser.add_argument("--operators", action="store_true", help="the most expensive operators as well")
+    parser.add_argument("--scaling", action="store_true", help="time and memory over the number of matches")
     options = parser.parse_args()
+    if options.scaling:
+        print_scaling(options.model, options.threads, options.repeats)
+        return
     rate = gemm_rate(options.threads)
     events, run_ms = profile(options.model, options.count, options.threads, options.repeats)
     print(

@@ -19,6 +19,8 @@ PAGE = ROOT / "docs" / "runtime.md"
 COMMANDS = {
     "one_thread": ("-m", "benchmarks.speed", "--threads", "1"),
     "two_threads": ("-m", "benchmarks.speed", "--threads", "2"),
+    "opening": ("-m", "benchmarks.opening"),
+    "scaling": ("-m", "benchmarks.profile_network", "--scaling", "--threads", "1"),
     "profile_500": ("-m", "benchmarks.profile_network", "--count", "500", "--threads", "1"),
     "profile_2000": ("-m", "benchmarks.profile_network", "--count", "2000", "--threads", "1"),
     "parity": ("export/parity.py",),

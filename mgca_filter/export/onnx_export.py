@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,9 +22,8 @@ from ..inference.model_file import CONTRACT_VERSION, METADATA_KEYS
 from ..inputs.attributes import CANDIDATE_MAX_RATIO, CANDIDATE_MIN_COUNT
 from ..network import MGCANet, save_network
 from ..network.config import ATTRIBUTE_CHANNELS
-from ..network.graph import AnnularConvolution
 from ..network.mgca_net import Prior
-from ..network.point_cn import ChannelBatchNorm, LinearNorm, PointCN
+from .compact_network import compact
 from .speed_passes import simplify
 
 OPSET = 17
@@ -61,53 +59,6 @@ class _Contract(nn.Module):
     def forward(self, correspondences: Tensor, attributes: Tensor) -> tuple[Tensor, Tensor]:
         output = self.network(correspondences, attributes)
         return output.logits, output.essential
-
-
-@torch.no_grad()
-def fold_batch_norm(network: MGCANet) -> MGCANet:
-    """Copy of a network in evaluation mode whose convolutions have taken in the BatchNorm that follows them.
-
-    Biases in front of a context norm go as well: it subtracts them.
-    """
-    folded = deepcopy(network).eval()
-    for parent in list(folded.modules()):
-        for name, child in parent.named_children():
-            if isinstance(child, LinearNorm):
-                setattr(parent, name, _folded(child))
-        if isinstance(parent, AnnularConvolution):
-            scale, shift = _scale_and_shift(parent.ring_norm)
-            parent.centre.mul_(scale)
-            parent.neighbour.mul_(scale)
-            setattr(parent, "ring_norm", _Shift(shift))  # noqa: B010 (not of the declared type)
-        if isinstance(parent, PointCN):
-            parent.linear1.register_parameter("bias", None)
-    return folded
-
-
-class _Shift(nn.Module):
-    """What is left of a BatchNorm when its scale has gone into the weights before it."""
-
-    shift: Tensor
-
-    def __init__(self, shift: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("shift", shift)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.shift
-
-
-def _folded(layer: LinearNorm) -> nn.Linear:
-    scale, shift = _scale_and_shift(layer.norm)
-    linear = nn.Linear(layer.linear.in_features, layer.linear.out_features)
-    linear.weight.copy_(layer.linear.weight * scale[:, None])
-    linear.bias.copy_(shift)
-    return linear
-
-
-def _scale_and_shift(norm: ChannelBatchNorm) -> tuple[Tensor, Tensor]:
-    scale = norm.weight * torch.rsqrt(norm.running_var + norm.eps)
-    return scale, norm.bias - norm.running_mean * scale
 
 
 def model_metadata(network: MGCANet, description: ModelDescription) -> dict[str, str]:
@@ -152,7 +103,7 @@ def _prior_weights(prior: Prior) -> dict[str, object]:
 
 def export_onnx(network: MGCANet, path: str | Path, metadata: Mapping[str, str]) -> None:
     """Write the ONNX file: opset 17, dynamic batch and N, declared output shapes, metadata inside."""
-    contract = _Contract(fold_batch_norm(network).cpu()).eval()
+    contract = _Contract(compact(network).cpu()).eval()
     example = torch.rand(2, 64, 4) - 0.5, torch.rand(2, 64, ATTRIBUTE_CHANNELS)
     dynamic = {name: {0: "B", 1: "N"} for name in (*INPUT_NAMES, "logits")} | {"essential": {0: "B"}}
     with warnings.catch_warnings():

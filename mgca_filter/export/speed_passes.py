@@ -1,29 +1,24 @@
 """The same ONNX graph from fewer and faster nodes. Needs the ``[export]`` extra.
 
 A traced graph computes at every call what could be known at export: weights from weights, targets of reshapes, the
-number of matches over and over. OpenCV's runtime, besides, fails on some of these computations of sizes. onnxslim
-computes constants and merges equal nodes; the passes here do what it does not: they tell from trial runs which sizes
-are B, N or constants, and know what is slow in a runtime.
+number of matches over and over. OpenCV's runtime, besides, fails on some of these computations of sizes. The passes
+here tell from trial runs which tensors are constants and which sizes are B or N, and know what is slow in a runtime.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
-import onnxslim
-from numpy.typing import NDArray
 from onnx import helper, numpy_helper
 
-Array = NDArray[Any]
-Size = int | str | None  # a constant, "B", "N", or something else
+from .rolled_loops import roll_loops
+from .trial_graph import Size, TrialGraph, all_inputs, bodies, signature
 
-# (B, N) of the trial runs: distinct from each other and from the widths of a network, and few matches among them.
-TRIAL_SIZES = ((3, 7), (5, 97), (2, 151))
-_SYMBOLS = ("B", "N")
+BLOCK = 256  # rows of a neighbour search at once: 32 MB with four graphs of 8000 matches
 _MAX_SIZES = 8  # elements of what may be the shape of a tensor
 
 
@@ -32,102 +27,219 @@ def simplify(model: onnx.ModelProto) -> onnx.ModelProto:
 
     1. sizes are taken from the input's shape once
     2. means become products, and sums escape slow fusions of ONNX Runtime
-    3. onnxslim computes constants, merges equal nodes and drops those that nothing depends on
-    4. tensors are numbered
+    3. constants are computed, and what does nothing or is of no use goes
+    4. equal steps that follow each other become Loops
+    5. equal nodes become one, and tensors are numbered
     """
     graph = TrialGraph(model)
     share_sizes(graph)
     turn_means_into_products(graph)
     keep_sums_from_fusion(graph)
-    return number_tensors(onnxslim.slim(graph.model()))
+    search_in_blocks(graph)
+    graph = TrialGraph(graph.model())
+    compute_constants(graph)
+    concatenate_transposed(graph)
+    drop_idle_nodes(graph)
+    join_sums(graph)
+    return number_tensors(merge_equal_nodes(roll_loops(graph.model())))
 
 
-class TrialGraph:
-    """A model under work, with the values of all its tensors in a few trial runs.
+def compute_constants(graph: TrialGraph) -> None:
+    """What depends on no input as constants, taken from a trial."""
+    kept = []
+    for node in graph.nodes:
+        if all(not name or name in graph.constants for name in all_inputs(node)):
+            for name in node.output:
+                graph.constant(name, graph.trials[0][name])
+        else:
+            kept.append(node)
+    graph.nodes = kept
 
-    Sizes inside the graph are told from their values in runs of different (B, N), which also sees what shape
-    inference loses.
 
-    Attributes:
-        nodes: in topological order; to be changed by the passes.
-        constants: names of the tensors that the file holds.
-        trials: values of all tensors by name, for each of the trial sizes.
+def drop_idle_nodes(graph: TrialGraph) -> None:
+    """Without nodes that hand on their input, that undo the one before, or whose output nobody reads."""
+    same: dict[str, str] = {}
+    transposed: dict[str, str] = {}
+    kept = []
+    for node in graph.nodes:
+        node.input[:] = [same.get(name, name) for name in node.input]
+        source, output = (node.input[0] if node.input else ""), node.output[0]
+        idle = node.op_type == "Identity" or (
+            node.op_type == "Cast"
+            and source in graph.trials[0]
+            and graph.element_type(source) == graph.element_type(output)
+        )
+        swaps = _swaps(node)
+        if output in graph.outputs:
+            kept.append(node)
+        elif idle:
+            same[output] = source
+        elif swaps and source in transposed:
+            same[output] = transposed[source]
+        else:
+            kept.append(node)
+        if swaps:
+            transposed[output] = source
+    read, useful = set(graph.outputs), []
+    for node in reversed(kept):
+        if read & set(node.output):
+            read |= all_inputs(node)
+            useful.append(node)
+    graph.nodes = useful[::-1]
+
+
+def concatenate_transposed(graph: TrialGraph) -> None:
+    """The transpose of a concatenation, of which a part is transposed already, as a concatenation of transposes."""
+    makers = {node.output[0]: node for node in graph.nodes}
+    kept = []
+    for node in graph.nodes:
+        source = makers.get(node.input[0]) if _swaps(node) else None
+        if source is not None and source.op_type == "Concat" and helper.get_node_attr_value(source, "axis") == -1:
+            parts = [makers.get(name) for name in source.input]
+            if any(part is not None and _swaps(part) for part in parts):
+                turned = [f"{name}_turned" for name in source.input]
+                kept += [
+                    helper.make_node("Transpose", [name], [new], f"{node.name}_{number}", perm=[0, 2, 1])
+                    for number, (name, new) in enumerate(zip(source.input, turned))
+                ]
+                node = helper.make_node("Concat", turned, list(node.output), node.name, axis=1)
+        kept.append(node)
+    graph.nodes = kept
+
+
+def _swaps(node: Any) -> bool:
+    return node.op_type == "Transpose" and list(node.attribute[0].ints) == [0, 2, 1]
+
+
+def join_sums(graph: TrialGraph) -> None:
+    """A sum of sums, where nobody else reads the inner one, as one ``Sum``: a product, its bias and what is added."""
+    readers = Counter(name for node in graph.nodes for name in node.input)
+    readers.update(graph.outputs)
+    makers: dict[str, Any] = {}
+    joined = set[str]()
+    for node in graph.nodes:
+        if node.op_type not in ("Add", "Sum"):
+            continue
+        terms: list[str] = []
+        for name in node.input:
+            if name in makers and readers[name] == 1:
+                terms.extend(makers[name].input)
+                joined.add(name)
+            else:
+                terms.append(name)
+        if len(terms) > len(node.input):
+            node.op_type, node.input[:] = "Sum", terms
+        makers[node.output[0]] = node
+    graph.nodes = [node for node in graph.nodes if node.output[0] not in joined]
+
+
+def search_in_blocks(graph: TrialGraph) -> None:
+    """The largest entries of a product's rows, a block of rows at a time: N x N entries at once are too many.
+
+    What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, whose indices are
+    appended to those of the blocks before. Every row sees the same numbers, so the indices stay the same.
     """
-
-    def __init__(self, model: onnx.ModelProto) -> None:
-        self._model = model
-        self.nodes: list[Any] = list(model.graph.node)
-        self.constants = {tensor.name for tensor in model.graph.initializer}
-        self.trials = _run_trials(model)
-        self._front: list[Any] = []
-        self._added: dict[str, Any] = {}
-
-    def shape(self, name: str) -> list[Size]:
-        """Sizes of a tensor that is no constant."""
-        return [_size(values) for values in zip(*(trial[name].shape for trial in self.trials))]
-
-    def sizes_in(self, name: str) -> list[Size]:
-        """Elements of a flattened integer tensor that holds equally many in each trial."""
-        return [_size(values) for values in zip(*(trial[name].reshape(-1).tolist() for trial in self.trials))]
-
-    def constant(self, name: str, value: Array) -> str:
-        """Add a constant unless one of this name is there; returns the name."""
-        if name not in self._added:
-            self._added[name] = numpy_helper.from_array(value, name)
-        return name
-
-    def size(self, size: Size) -> str:
-        """Name of an integer tensor (1,) that holds B, N or a constant."""
-        if isinstance(size, int):
-            return self.constant(f"size_{size}", np.array([size], np.int64))
-        source = self._model.graph.input[0].name
-        axis = self.constant(f"axis_{size}", np.array([_SYMBOLS.index(str(size))], np.int64))
-        shape = self.in_front("Shape", [source], f"{source}_shape")
-        return self.in_front("Gather", [shape, axis], f"size_{size}", axis=0)
-
-    def in_front(self, operator: str, inputs: Sequence[str], output: str, **attributes: Any) -> str:
-        """Add a node in front of all others, made of B and N alone, unless it is there; returns its output."""
-        if not any(node.output[0] == output for node in self._front):
-            self._front.append(helper.make_node(operator, inputs, [output], output, **attributes))
-        return output
-
-    def model(self) -> onnx.ModelProto:
-        """The model of all these nodes and constants, whether needed or not."""
-        model = onnx.ModelProto()
-        model.CopyFrom(self._model)
-        model.graph.initializer.extend(self._added.values())
-        del model.graph.node[:], model.graph.value_info[:]
-        model.graph.node.extend([*self._front, *self.nodes])
-        return model
+    readers = Counter(name for node in graph.nodes for name in node.input)
+    makers = {node.output[0]: node for node in graph.nodes}
+    kept, blocked = [], set[str]()
+    for node in graph.nodes:
+        product = makers.get(node.input[0]) if node.op_type == "TopK" and not readers[node.output[0]] else None
+        if product is None or product.op_type != "MatMul" or readers[node.input[0]] > 1:
+            kept.append(node)
+        else:
+            blocked.add(node.input[0])
+            kept += _block_search(graph, product, node)
+    graph.nodes = [node for node in kept if node.output[0] not in blocked]
 
 
-def _size(values: Sequence[int]) -> Size:
-    """What one size is, given its value in each trial."""
-    if len(set(values)) == 1:
-        return int(values[0])
-    for symbol, trials in zip(_SYMBOLS, zip(*TRIAL_SIZES)):
-        if tuple(values) == trials:
-            return symbol
-    return None
+def _block_search(graph: TrialGraph, product: Any, largest: Any) -> list[Any]:
+    """The nodes in the place of a product and of the largest entries of its rows."""
+    name, (_, indices) = largest.name, largest.output
+    rows, columns = product.input
+    *outer, _, k = shape = graph.shape(indices)
+    axis = graph.constant(f"axis_{len(shape) - 2}_rows", np.array([len(shape) - 2], np.int64))
+    block = graph.constant("block", np.array([BLOCK], np.int64))
+    count = graph.size("N")
+    above = graph.in_front("Add", [count, graph.constant("block_less_one", np.array([BLOCK - 1], np.int64))], "N_above")
+    turns = graph.in_front("Squeeze", [graph.in_front("Div", [above, block], "blocks")], "blocks_scalar")
+    zero = [graph.size(size) for size in (*outer, 0, k)]
+    key = "_".join(map(str, [*outer, k]))
+    shape_of_none = graph.in_front("Concat", zero, f"shape_of_none_{key}", axis=0)
+    nothing = numpy_helper.from_array(np.zeros(1, np.int64))
+    none = f"{name}_none"
+    turn, on, before, after = (f"{name}_{part}" for part in ("turn", "on", "before", "after"))
+    start, end, part, nearness = (f"{name}_{item}" for item in ("start", "end", "part", "nearness"))
+    body = helper.make_graph(
+        [
+            helper.make_node("Mul", [turn, block], [start], start),
+            helper.make_node("Add", [start, block], [end], end),
+            helper.make_node("Slice", [rows, start, end, axis], [part], part),
+            helper.make_node("MatMul", [part, columns], [nearness], product.name),
+            _renamed(largest, [nearness, largest.input[1]], [f"{name}_values", f"{name}_indices"]),
+            helper.make_node("Concat", [before, f"{name}_indices"], [after], after, axis=len(shape) - 2),
+        ],
+        f"{name}_block",
+        [
+            helper.make_tensor_value_info(turn, onnx.TensorProto.INT64, []),
+            helper.make_tensor_value_info(on, onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info(before, onnx.TensorProto.INT64, [*outer, None, k]),
+        ],
+        [
+            helper.make_tensor_value_info(on, onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info(after, onnx.TensorProto.INT64, [*outer, None, k]),
+        ],
+    )
+    return [
+        helper.make_node("ConstantOfShape", [shape_of_none], [none], none, value=nothing),
+        helper.make_node("Loop", [turns, "", none], [indices], f"{name}_blocks", body=body),
+    ]
 
 
-def _run_trials(model: onnx.ModelProto) -> list[Mapping[str, Array]]:
-    """Values of all tensors that nodes give, for random input of each of the trial sizes."""
-    everything = onnx.ModelProto()
-    everything.CopyFrom(model)
-    names = [name for node in model.graph.node for name in node.output if name]
-    del everything.graph.output[:]
-    everything.graph.output.extend(onnx.ValueInfoProto(name=name) for name in names)
-    options = onnxruntime.SessionOptions()
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    session = onnxruntime.InferenceSession(everything.SerializeToString(), options, providers=["CPUExecutionProvider"])
-    widths = {value.name: value.type.tensor_type.shape.dim[2].dim_value for value in model.graph.input}
-    trials: list[Mapping[str, Array]] = []
-    for batch, count in TRIAL_SIZES:
-        rng = np.random.default_rng(0)
-        feed = {name: rng.random((batch, count, width), dtype=np.float32) for name, width in widths.items()}
-        trials.append({**feed, **dict(zip(names, session.run(names, feed)))})
-    return trials
+def _renamed(node: Any, inputs: list[str], outputs: list[str]) -> Any:
+    copy = onnx.NodeProto()
+    copy.CopyFrom(node)
+    copy.input[:], copy.output[:] = inputs, outputs
+    return copy
+
+
+def merge_equal_nodes(model: onnx.ModelProto) -> onnx.ModelProto:
+    """One constant for equal ones, one node for nodes that do the same to the same, in bodies as well."""
+    values: dict[Any, str] = {}
+    names: dict[str, str] = {}
+    for tensor in model.graph.initializer:
+        array = numpy_helper.to_array(tensor)
+        names[tensor.name] = values.setdefault((array.dtype.str, array.shape, array.tobytes()), tensor.name)
+    _merge(model.graph, names)
+    read = {name for node in model.graph.node for name in all_inputs(node)}
+    constants = [tensor for tensor in model.graph.initializer if tensor.name in read]
+    del model.graph.initializer[:]
+    model.graph.initializer.extend(constants)
+    return model
+
+
+def _merge(graph: Any, names: Mapping[str, str]) -> None:
+    """Merge the nodes of a graph; ``names`` tell what tensors from outside are called now."""
+    names, known, kept = dict(names), dict[tuple[Any, ...], Any](), []
+    outputs = {value.name for value in graph.output}
+    # OpenCV writes over what a Loop starts with: each has its own.
+    starts = {name for node in graph.node if node.op_type == "Loop" for name in node.input[2:]}
+    for node in graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+        for body in bodies(node):
+            _merge(body, names)
+        key = (signature(node), tuple(node.input), node.output[0] if node.output[0] in starts else "")
+        first = known.setdefault(key, node)
+        if first is node or outputs & set(node.output):
+            kept.append(node)
+        else:
+            names.update(zip(node.output, first.output))
+    copies = []
+    for node in kept:
+        copy = onnx.NodeProto()
+        copy.CopyFrom(node)
+        copies.append(copy)
+    del graph.node[:]
+    graph.node.extend(copies)
 
 
 def share_sizes(graph: TrialGraph) -> None:
@@ -189,8 +301,13 @@ def _mean_as_product(graph: TrialGraph, node: Any, axes: list[int]) -> list[Any]
     """A mean over axis 1 of (B, N, C), or over axes 1 and 2 of (B, N, k, C), as a product; else the node itself."""
     source, output = node.input[0], node.output[0]
     shape = graph.shape(source)
-    if axes == [1] and len(shape) == 3 and shape[1] is not None:
-        return [helper.make_node("MatMul", [_row(graph, shape[1], 1), source], [output], node.name)]
+    axes, axis = [number % len(shape) for number in axes], len(shape) - 2
+    if axes == [axis] and len(shape) in (3, 4):
+        length = shape[axis]
+        if length is not None:
+            return [helper.make_node("MatMul", [_row(graph, length, 1), source], [output], node.name)]
+        if (factor := graph.multiple_of_count(source, axis)) is not None:
+            return [helper.make_node("MatMul", [_row(graph, "N", factor), source], [output], node.name)]
     if axes == [1, 2] and len(shape) == 4 and shape[1] is not None and isinstance(shape[2], int):
         rows, mean, width = f"{output}_rows", f"{output}_mean", shape[3]
         flat = graph.constant(f"{rows}_target", np.array([0, -1, width], np.int64))
@@ -210,7 +327,9 @@ def _row(graph: TrialGraph, length: int | str, factor: int) -> str:
         return graph.constant(f"mean_of_{n}", np.full((1, 1, n), 1.0 / n, np.float32))
     row = f"mean_of_{factor}_{length}"
     unit = numpy_helper.from_array(np.ones(1, np.float32))
-    count = graph.in_front("Mul", [graph.size(length), graph.size(factor)], f"{row}_count")
+    count = graph.size(length)
+    if factor > 1:
+        count = graph.in_front("Mul", [count, graph.size(factor)], f"{row}_count")
     shape = graph.in_front("Concat", [graph.size(1), graph.size(1), count], f"{row}_shape", axis=0)
     ones = graph.in_front("ConstantOfShape", [shape], f"{row}_ones", value=unit)
     divisor = graph.in_front("Cast", [count], f"{row}_divisor", to=onnx.TensorProto.FLOAT)
@@ -245,7 +364,15 @@ def number_tensors(model: onnx.ModelProto) -> onnx.ModelProto:
     del model.graph.value_info[:]
     for tensor in model.graph.initializer:
         tensor.name = short(tensor.name)
-    for node in model.graph.node:
+    _rename(model.graph, short)
+    return model
+
+
+def _rename(graph: Any, short: Callable[[str], str]) -> None:
+    for node in graph.node:
         node.input[:] = map(short, node.input)
         node.output[:] = map(short, node.output)
-    return model
+        for body in bodies(node):
+            for value in [*body.input, *body.output]:
+                value.name = short(value.name)
+            _rename(body, short)

@@ -23,6 +23,13 @@ _LOG_ERRORS_ONLY = 3
 # The product that this fusion makes of a mean over the matches rounds by the number of threads, and what a rounding
 # moves across a nearest-neighbour choice moves logits by tenths. Without it all numbers of threads give the same bits.
 _DISABLED_OPTIMIZERS = ["MatMulScaleFusion"]
+# Squaring a matrix twenty times, the heart of the eight-point algorithm, is beyond half precision and TF32: providers
+# that would use them by default are told not to. What the caller sets stays. In the providers' own names.
+_FULL_PRECISION = {
+    "OpenVINOExecutionProvider": {"precision": "FP32"},
+    "CUDAExecutionProvider": {"use_tf32": "0"},
+    "TensorrtExecutionProvider": {"trt_fp16_enable": "0"},
+}
 PROVIDERS_VARIABLE = "MGCA_FILTER_PROVIDERS"
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"
 TELEMETRY_VARIABLE = "ORT_DISABLE_TELEMETRY"
@@ -112,9 +119,7 @@ def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) ->
     reason = f"this ONNX Runtime has no {', '.join(missing)}" if missing else ""
     if usable and usable != [CPU_PROVIDER]:
         try:
-            session = runtime.InferenceSession(
-                file.content, options, providers=usable, disabled_optimizers=_DISABLED_OPTIMIZERS
-            )
+            session = _open_in_full_precision(runtime, file, options, usable)
             lost = [name for name in names if name not in missing and name not in session.get_providers()]
             reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
             if reason:
@@ -132,6 +137,26 @@ def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) ->
         if type(error).__name__ in _FILE_ERRORS:
             raise ModelError(f"{file.path}: not a readable ONNX model, truncated or damaged ({error})") from error
         raise BackendError(f"ONNX Runtime cannot start ({error})") from error
+
+
+def _open_in_full_precision(runtime: Any, file: ModelFile, options: Any, providers: list[Any]) -> Any:
+    """A session whose providers compute in float32; as they are where a provider does not know that option yet."""
+    told = [_in_full_precision(provider) for provider in providers]
+    try:
+        return runtime.InferenceSession(file.content, options, providers=told, disabled_optimizers=_DISABLED_OPTIMIZERS)
+    except Exception:
+        if told == providers:
+            raise
+    return runtime.InferenceSession(
+        file.content, options, providers=providers, disabled_optimizers=_DISABLED_OPTIMIZERS
+    )
+
+
+def _in_full_precision(provider: str | tuple[str, dict[str, Any]]) -> str | tuple[str, dict[str, Any]]:
+    """A provider with the options that keep it in float32 in front of the caller's."""
+    name, options = (provider, {}) if isinstance(provider, str) else provider
+    precision = _FULL_PRECISION.get(name)
+    return provider if precision is None else (name, {**precision, **options})
 
 
 def _session_options(runtime: Any) -> Any:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from .eight_point import smallest_eigenvector
+from .eight_point import Array, constant, homogeneous_products, lines_table, smallest_eigenvector_row
 
 # Widths of the kernel, normalised coordinates; the last is about a pixel.
 KERNEL_WIDTHS = (0.1, 0.052, 0.027, 0.014, 0.0072, 0.0037, 0.0019, 0.001)
@@ -22,11 +22,66 @@ KERNEL_WIDTHS = (0.1, 0.052, 0.027, 0.014, 0.0072, 0.0037, 0.0019, 0.001)
 WEIGHT_LOGIT = 3.0
 ORTHONORMALISATIONS = 12
 DAMPING = 1e-6
-_NEXT, _LAST = (1, 2, 0), (2, 0, 1)
 # _CROSS[i, j] is the cross product of the basis vectors e_i and e_j.
 _CROSS = np.array(
-    [[[0, 0, 0], [0, 0, 1], [0, -1, 0]], [[0, 0, -1], [0, 0, 0], [1, 0, 0]], [[0, 1, 0], [-1, 0, 0], [0, 0, 0]]]
+    [[[0, 0, 0], [0, 0, 1], [0, -1, 0]], [[0, 0, -1], [0, 0, 0], [1, 0, 0]], [[0, 1, 0], [-1, 0, 0], [0, 0, 0]]], float
 )
+# [e_k]× for the three axes: rows of a rotation's derivative.
+_GENERATORS = _CROSS.transpose(0, 2, 1)
+# Columns of what a step sees of a match: derivatives by ω and δ, the error, two coefficients of each epipolar line.
+_UNKNOWNS, _ERROR, _COLUMNS = 6, 6, 11
+
+
+def _columns_table() -> Array:
+    """vec((1, t) ⊗ vec(R)) @ table, as (9, 11): x2 ⊗ x1 @ that = the columns of a step.
+
+    By ω: x2ᵀ [t]× [e_k]× R x1; by δ: x2ᵀ [e_k]× R x1; the error x2ᵀ [t]× R x1; a and b of both epipolar lines.
+    """
+    table = np.zeros((4, 9, 9, _COLUMNS))
+    for entry in range(9):
+        R = np.eye(9)[entry].reshape(3, 3)
+        for axis, generator in enumerate(_GENERATORS):
+            table[0, entry, :, 3 + axis] = (generator @ R).ravel()
+            for other in range(3):
+                table[1 + axis, entry, :, other] = (generator @ _GENERATORS[other] @ R).ravel()
+            table[1 + axis, entry, :, _ERROR:] = ((generator @ R).ravel() @ lines_table()).reshape(9, 5)
+    return table.reshape(36, 9 * _COLUMNS)
+
+
+def _decomposition_table() -> Array:
+    """vec((vec(E), t) ⊗ vec(E)) @ table = cofactors of √2 E less [t]× √2 E, row by row (Horn 1990), E of unit norm."""
+    table = np.zeros((12, 9, 9))
+    for i in range(3):
+        down, up = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            right, left = (j + 1) % 3, (j + 2) % 3
+            table[3 * down + right, 3 * up + left, 3 * i + j] += 2.0
+            table[3 * down + left, 3 * up + right, 3 * i + j] -= 2.0
+    for axis, generator in enumerate(_GENERATORS):
+        for entry in range(9):
+            table[9 + axis, entry] -= 2**0.5 * (generator @ np.eye(9)[entry].reshape(3, 3)).ravel()
+    return table.reshape(108, 9)
+
+
+def _rotation_table() -> Array:
+    """vec(q ⊗ q) @ table = the rotation of a unit quaternion q = (w, x, y, z), row by row."""
+    table = np.zeros((4, 4, 3, 3))
+    table[0, 0] = np.eye(3)
+    for k in range(3):
+        table[0, 1 + k] += 2.0 * _GENERATORS[k]
+        for j in range(3):
+            table[1 + j, 1 + k, j, k] += 2.0
+        table[1 + k, 1 + k] -= np.eye(3)
+    return table.reshape(16, 9)
+
+
+_COLUMNS_TABLE, _DECOMPOSITION, _ROTATION = _columns_table(), _decomposition_table(), _rotation_table()
+_CROSS_TABLE = _CROSS.transpose(0, 2, 1).reshape(3, 9)
+# (1, t) where t stands among the unknowns; the step of t, and of half of the rotation vector, from the solution.
+_TRANSLATION = np.zeros((_COLUMNS, 4))
+_TRANSLATION[3:6, 1:] = np.eye(3)
+_HALF_ROTATION = np.zeros((_COLUMNS, 4))
+_HALF_ROTATION[:3, 1:] = 0.5 * np.eye(3)
 
 
 def refine_essential(correspondences: Tensor, logits: Tensor, essential: Tensor) -> Tensor:
@@ -40,9 +95,7 @@ def refine_essential(correspondences: Tensor, logits: Tensor, essential: Tensor)
         logits: (B, N) of the matches.
         essential: (B, 3, 3) to start from, of any scale and rank; comes back where matches are degenerate.
     """
-    one = torch.ones_like(correspondences[..., :1])
-    x1 = torch.cat([correspondences[..., :2], one], -1)  # (B, N, 3)
-    x2 = torch.cat([correspondences[..., 2:], one], -1)
+    phi = homogeneous_products(correspondences)  # (B, N, 9)
     weights = torch.sigmoid(logits - WEIGHT_LOGIT)
     weights = (weights / weights.sum(1, keepdim=True).clamp_min(1e-12)).unsqueeze(-1)  # (B, N, 1)
     if weights.requires_grad:
@@ -50,73 +103,62 @@ def refine_essential(correspondences: Tensor, logits: Tensor, essential: Tensor)
         weights.register_hook(partial(torch.nan_to_num, nan=0.0, posinf=0.0, neginf=0.0))
     R, t = _decompose(essential.detach())
     for width in KERNEL_WIDTHS[:-1]:
-        R, t = _step(x1, x2, weights.detach(), R, t, width)
-    R, t = _step(x1, x2, weights, R, t, KERNEL_WIDTHS[-1])
-    refined = _cross_matrix(t) @ R
-    squared_norm = refined.square().sum((1, 2), keepdim=True)
-    # Two for a unit translation and a rotation. Degenerate matches may end in what is not a number: never above 1.
-    return torch.where(squared_norm > 1.0, refined / squared_norm.clamp_min(1.0).sqrt(), essential)
+        R, t = _step(phi, weights.detach(), R, t, width)
+    R, t = _step(phi, weights, R, t, KERNEL_WIDTHS[-1])
+    refined = (t[:, 1:].transpose(1, 2) @ constant(_CROSS_TABLE, t)).view(-1, 3, 3) @ R
+    norm = refined.norm(dim=(1, 2), keepdim=True)
+    # √2 for a unit translation and a rotation. Degenerate matches may end in what is not a number: never above 1.
+    return torch.where(norm > 1.0, refined / norm.clamp_min(1.0), essential)
 
 
-def _step(x1: Tensor, x2: Tensor, weights: Tensor, R: Tensor, t: Tensor, width: float) -> tuple[Tensor, Tensor]:
-    """One Gauss–Newton step: R ← exp(ω) R, t ← t + δ, scaled to unit length."""
-    X = x1 @ R.transpose(1, 2)  # (B, N, 3), viewing rays of image 1 in the second camera
-    v = x2 @ _cross_matrix(t)  # x2 × t: the epipolar plane through x2
-    error = (X * v).sum(-1, keepdim=True)  # x2ᵀ E x1
-    normal = (X @ _cross_matrix(t))[..., :2].square().sum(-1, keepdim=True)
-    normal = (normal + (v @ R)[..., :2].square().sum(-1, keepdim=True)).clamp_min(1e-12)  # of both epipolar lines
-    kernel = width**2 * normal / (width**2 * normal + error.square())
-    jacobian = torch.cat([_cross_products(X, torch.cat([v, x2], -1)), error], -1)  # (B, N, 7): by ω, by δ; the error
-    system = (jacobian * (weights * kernel.square() / normal)).transpose(1, 2) @ jacobian  # (B, 7, 7)
-    along = F.pad(t, (3, 1)).unsqueeze(2)  # (B, 7, 1); the length of t is free: hold it
-    eye = torch.eye(7, dtype=t.dtype, device=t.device)
-    diagonal = system * eye
-    trace = diagonal.sum((1, 2), keepdim=True)
-    system = system + trace * (along @ along.transpose(1, 2)) + DAMPING * diagonal + 1e-9 * eye
-    step = -_solve(system[:, :6])  # (B, 6)
-    t = t + step[:, 3:]
-    return _cayley(step[:, :3]) @ R, t / t.square().sum(1, keepdim=True).clamp_min(1e-12).sqrt()
+def _step(phi: Tensor, weights: Tensor, R: Tensor, t: Tensor, width: float) -> tuple[Tensor, Tensor]:
+    """One Gauss–Newton step: R ← exp(ω) R, t ← t + δ, scaled to unit length.
+
+    Args:
+        phi: x2 ⊗ x1 (B, N, 9). weights: (B, N, 1). R: (B, 3, 3). t: (1, t) as a column (B, 4, 1).
+    """
+    table = (t @ R.reshape(-1, 1, 9)).view(-1, 1, 36) @ constant(_COLUMNS_TABLE, R)
+    columns = phi @ table.view(-1, 9, _COLUMNS)  # (B, N, 11)
+    sums = np.zeros((_COLUMNS, 2))  # of the squares: width² normal, and that + error²
+    sums[_ERROR + 1 :] = width**2
+    sums[_ERROR, 1] = 1.0
+    # kernel² / normal over width², the kernel being width² normal / (width² normal + error²)
+    numerator, denominator = (columns.square() @ constant(sums, R) + 1e-18).split([1, 1], -1)
+    robust = columns * (weights * (numerator / denominator.square()))
+    system = robust.transpose(1, 2) @ columns  # (B, 11, 11): the unknowns and the error come first
+    eye = torch.eye(_COLUMNS, dtype=R.dtype, device=R.device)
+    trace = (system * constant(np.diag([1.0] * 7 + [0.0] * 4), R)).sum((1, 2), keepdim=True)
+    along = constant(_TRANSLATION, R) @ t  # the length of t is free: hold it
+    system = system * (1.0 + DAMPING * eye) + 1e-9 * eye + (trace * along) @ along.transpose(1, 2)
+    solution = _solve(system)  # (B, 11, 1)
+    t = t - constant(_TRANSLATION.T, R) @ solution
+    t = t / torch.cat([t[:, :1], t[:, 1:].norm(dim=1, keepdim=True).expand(-1, 3, -1)], 1)
+    q = constant(np.eye(4)[:, :1], R) - constant(_HALF_ROTATION.T, R) @ solution  # (B, 4, 1), a rotation for any length
+    q = q / q.norm(dim=1, keepdim=True)
+    turn = (q @ q.transpose(1, 2)).view(-1, 1, 16) @ constant(_ROTATION, R)  # Cayley's
+    return turn.view(-1, 3, 3) @ R, t
 
 
 def _decompose(E: Tensor) -> tuple[Tensor, Tensor]:
-    """A rotation (B, 3, 3) and a unit translation (B, 3) with [t]× R near E, up to sign (Horn 1990)."""
-    E = E / (0.5 * E.square().sum((1, 2), keepdim=True)).clamp_min(1e-30).sqrt()
-    t = smallest_eigenvector(E @ E.transpose(1, 2))
-    down, up = E[:, _NEXT], E[:, _LAST]
-    cofactors = down[:, :, _NEXT] * up[:, :, _LAST] - down[:, :, _LAST] * up[:, :, _NEXT]
-    R = cofactors - _cross_matrix(t) @ E
+    """A rotation (B, 3, 3) and a unit translation, (1, t) as a column (B, 4, 1), with [t]× R near E, up to sign."""
+    vector = E.reshape(-1, 9, 1)
+    vector = vector / vector.norm(dim=1, keepdim=True)
+    E = vector.view(-1, 3, 3)
+    t = smallest_eigenvector_row(E @ E.transpose(1, 2)).transpose(1, 2)
+    t = t / t.norm(dim=1, keepdim=True)  # (B, 3, 1)
+    products = torch.cat([vector, t], 1) @ vector.transpose(1, 2)  # (B, 12, 9)
+    R = (products.view(-1, 1, 108) @ constant(_DECOMPOSITION, E)).view(-1, 3, 3)
+    eye = torch.eye(3, dtype=E.dtype, device=E.device)
     for _ in range(ORTHONORMALISATIONS):  # Newton–Schulz
-        R = 1.5 * R - 0.5 * R @ R.transpose(1, 2) @ R
-    return R, t
+        R = R @ (1.5 * eye - 0.5 * (R.transpose(1, 2) @ R))
+    return R, F.pad(t, (0, 0, 1, 0), value=1.0)
 
 
-def _solve(augmented: Tensor) -> Tensor:
-    """Solutions (B, n) of symmetric positive definite systems [A | b] (B, n, n + 1): Gauss–Jordan, unrolled."""
-    n = augmented.shape[1]
-    eye = torch.eye(n, dtype=augmented.dtype, device=augmented.device)
-    for k in range(n):
-        pivot = augmented[:, k : k + 1] / augmented[:, k : k + 1, k : k + 1]  # (B, 1, n + 1)
-        augmented = augmented - (augmented[:, :, k : k + 1] - eye[:, k : k + 1]) * pivot
-    return augmented[:, :, n]
-
-
-def _cayley(rotation_vector: Tensor) -> Tensor:
-    """Rotations (B, 3, 3) about (B, 3) by about its length, a rotation for any length (Cayley)."""
-    half = 0.5 * rotation_vector
-    square = half.square().sum(1).view(-1, 1, 1)
-    eye = torch.eye(3, dtype=half.dtype, device=half.device)
-    outer = half.unsqueeze(2) * half.unsqueeze(1)
-    return ((1.0 - square) * eye + 2.0 * _cross_matrix(half) + 2.0 * outer) / (1.0 + square)
-
-
-def _cross_products(a: Tensor, b: Tensor) -> Tensor:
-    """a × b (B, N, 6) of vectors a (B, N, 3) with each of two vectors b (B, N, 6)."""
-    table = np.concatenate([np.kron(np.eye(2), part) for part in _CROSS])  # (18, 6)
-    products = (a.unsqueeze(-1) * b.unsqueeze(-2)).flatten(2)  # (B, N, 18)
-    return products @ torch.tensor(table, dtype=a.dtype, device=a.device)
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    """Matrices (B, 3, 3) with [v]× w = v × w, of vectors (B, 3)."""
-    table = torch.tensor(_CROSS.transpose(0, 2, 1).reshape(3, 9), dtype=v.dtype, device=v.device)
-    return (v @ table).view(-1, 3, 3)
+def _solve(system: Tensor) -> Tensor:
+    """Solutions (B, 11, 1) for the first six unknowns of [A | b] in the first rows and columns: Gauss–Jordan."""
+    for k in range(_UNKNOWNS):
+        axis = np.eye(_COLUMNS)[:, k : k + 1]
+        row = constant(axis.T, system) @ system  # (B, 1, 11)
+        column = system @ constant(axis, system) - constant(axis, system)
+        system = system - column @ (row / (row @ constant(axis, system)))
+    return system[:, :, _ERROR : _ERROR + 1]

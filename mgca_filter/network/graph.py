@@ -15,7 +15,7 @@ from torch.nn import functional as F
 from .point_cn import ChannelBatchNorm, ContextNorm, LinearNorm, NormLinear
 
 RING = 3  # neighbours that one annular kernel covers
-_FAR = 1e30
+FAR = 1e30
 
 
 def nearest_neighbours(features: Tensor, k: int) -> Tensor:
@@ -28,7 +28,7 @@ def nearest_neighbours(features: Tensor, k: int) -> Tensor:
     x = x - x.mean(1, keepdim=True)  # distances survive, cancellation does not
     count = x.shape[1]
     # Per row i, the order of |x_i − x_j|² is that of |x_j|²/2 − x_i·x_j.
-    penalty = F.pad(0.5 * x.square().sum(-1, keepdim=True), (0, 0, 0, k), value=_FAR)
+    penalty = F.pad(0.5 * x.square().sum(-1, keepdim=True), (0, 0, 0, k), value=FAR)
     keys = torch.cat([F.pad(x, (0, 0, 0, k)), -penalty], -1)  # (B, N + k, C + 1)
     queries = torch.cat([x, torch.ones_like(x[..., :1])], -1)
     with torch.autocast(x.device.type, enabled=False):  # neighbours must not depend on the training precision
@@ -137,7 +137,7 @@ class AttentionalFusion(nn.Module):
     def forward(self, a: Tensor, b: Tensor) -> Tensor:
         both = a + b
         w = torch.sigmoid(self.local(both) + self.pooled(both.mean(1, keepdim=True)))
-        return 2.0 * (a * w + b * (1.0 - w))
+        return 2.0 * (b + (a - b) * w)
 
 
 class GraphBlock(nn.Module):

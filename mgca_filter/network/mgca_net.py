@@ -73,9 +73,9 @@ class Head(nn.Module):
         logits = self.logit(features)[..., 0].float()
         enough = match_count(logits) >= MINIMUM_CONSENSUS  # (B, 1)
         logits = torch.where(enough, logits, 0.0) + prior
-        a, b = self.weight(features).float().unbind(-1)
+        a, b = self.weight(features).float().split(1, -1)
         # sigmoid(a) exp(b), normalised to sum 1, is the softmax of log sigmoid(a) + b.
-        log_weights = F.logsigmoid(a) + b + torch.where(better_half(logits), 0.0, -1e4)
+        log_weights = (F.logsigmoid(a) + b)[..., 0] + torch.where(better_half(logits), 0.0, -1e4)
         with torch.autocast(logits.device.type, enabled=False):
             essential = weighted_eight_point(correspondences, log_weights.softmax(-1))
         return HeadOutput(logits, essential)

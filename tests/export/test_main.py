@@ -30,11 +30,6 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.fixture(autouse=True)
-def one_round(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ONNXSLIM_MAX_ITER", "1")  # further rounds of onnxslim leave the answer and take their time
-
-
 @pytest.mark.slow
 def test_files_are_written_listed_and_compared(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

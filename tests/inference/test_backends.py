@@ -24,6 +24,7 @@ import mgca_filter.inference.torch_ as torch_backend
 from mgca_filter import BackendError, ModelError, filter_matches
 from mgca_filter import inference as backends
 from mgca_filter.inference import Backend, OnnxBackend, TorchBackend, open_backend, shared_backend
+from mgca_filter.inference import onnxruntime_ as onnxruntime_backend
 from mgca_filter.inference.onnxruntime_ import TELEMETRY_VARIABLE
 
 
@@ -350,3 +351,56 @@ def test_the_environment_says_which_providers_run_where_the_caller_does_not(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         OnnxBackend(model_file, ["CPUExecutionProvider"])
+
+
+class RuntimeWithProviders:
+    """Stands for an ONNX Runtime with providers that are not installed here; notes what sessions are opened with."""
+
+    def __init__(self, knows_precision: bool = True) -> None:
+        self.opened: list[list] = []
+        self._knows_precision = knows_precision
+
+    def __getattr__(self, name: str) -> object:
+        import onnxruntime
+
+        return getattr(onnxruntime, name)
+
+    def get_available_providers(self) -> list[str]:
+        return ["OpenVINOExecutionProvider", "CUDAExecutionProvider", "OtherProvider", "CPUExecutionProvider"]
+
+    def InferenceSession(self, content: bytes, options: object, providers: list, **_: object) -> object:  # noqa: N802
+        self.opened.append(providers)
+        if not self._knows_precision and any("use_tf32" in given[1] for given in providers if len(given) == 2):
+            raise RuntimeError("unknown option")
+        names = [given if isinstance(given, str) else given[0] for given in providers]
+        return types.SimpleNamespace(get_providers=lambda: names)
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ("OpenVINOExecutionProvider", ("OpenVINOExecutionProvider", {"precision": "FP32"})),
+        (
+            ("OpenVINOExecutionProvider", {"precision": "FP16", "device_type": "GPU"}),
+            ("OpenVINOExecutionProvider", {"precision": "FP16", "device_type": "GPU"}),
+        ),
+        (("CUDAExecutionProvider", {"device_id": 1}), ("CUDAExecutionProvider", {"use_tf32": "0", "device_id": 1})),
+        ("OtherProvider", "OtherProvider"),
+    ],
+)
+def test_providers_are_told_to_compute_in_full_precision(model_file: Path, monkeypatch, asked, told) -> None:
+    runtime = RuntimeWithProviders()
+    monkeypatch.setattr(onnxruntime_backend, "_import_runtime", lambda: runtime)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        OnnxBackend(model_file, [asked, "CPUExecutionProvider"])
+    assert runtime.opened == [[told, "CPUExecutionProvider"]]
+
+
+def test_a_provider_that_does_not_know_the_option_is_used_as_it_is(model_file: Path, monkeypatch) -> None:
+    runtime = RuntimeWithProviders(knows_precision=False)
+    monkeypatch.setattr(onnxruntime_backend, "_import_runtime", lambda: runtime)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        OnnxBackend(model_file, ["CUDAExecutionProvider"])
+    assert runtime.opened == [[("CUDAExecutionProvider", {"use_tf32": "0"})], ["CUDAExecutionProvider"]]
