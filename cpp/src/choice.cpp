@@ -30,6 +30,7 @@ constexpr int kShareRounds = 8;
 // Gaps between log-likelihoods are compressed beyond this.
 constexpr double kGapUnit = 3.0;
 constexpr double kLargestPrior = 0.98;
+constexpr double kTie = 3.0;
 constexpr double kTiny = 1e-12;
 // Relative support is measured at these distances, pixels, which count this much.
 constexpr std::array<double, 3> kSupportPx{1.0, 2.0, 4.0}, kSupportWeights{1.0, 1.0, 0.5};
@@ -285,10 +286,12 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         merit[h] += factor * relative[h];
         whole_merit.push_back(whole_by_scale[h][column] + factor * whole_relative[h]);
     }
-    // Crowded matches count less for one answer against another; of hypotheses of one answer all matches tell the best.
+    // Crowded matches count less for one answer against another; between hypotheses of one answer, and near ties, all
+    // matches tell the best.
     const std::size_t answer = position_of_largest(merit);
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
-        if (!(pose_angle_deg(hypotheses[h].pose, hypotheses[answer].pose) < kAlternativeDeg)) {
+        const double angle = pose_angle_deg(hypotheses[h].pose, hypotheses[answer].pose);
+        if (!(angle < kAlternativeDeg || merit[h] > merit[answer] - kTie)) {
             whole_merit[h] = -std::numeric_limits<double>::infinity();
         }
     }

@@ -44,6 +44,8 @@ _LEAST_SHARE, _LARGEST_SHARE, _SHARE_ROUNDS = 1e-3, 0.99, 8
 _SUPPORT_PX, _SUPPORT_WEIGHTS = (1.0, 2.0, 4.0), (1.0, 1.0, 0.5)
 # Gaps between log-likelihoods are compressed beyond this.
 GAP_UNIT = 3.0
+# Hypotheses whose log-likelihoods differ by less are equally likely.
+TIE = 3.0
 _TINY = 1e-12
 
 FEATURES = (
@@ -290,9 +292,11 @@ def judge(
     # One scale for all hypotheses: that of the most likely one.
     column = int(np.argmax(by_scale.max(axis=0)))
     likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
-    answer = int(np.argmax(likelihood + _support_bonus(residuals, weights * counts, coefficients)))
-    # Crowded matches count less for one answer against another; of hypotheses of one answer all matches tell the best.
-    alike = _angles_to(hypotheses, answer) < ALTERNATIVE_DEG
+    merit = likelihood + _support_bonus(residuals, weights * counts, coefficients)
+    answer = int(np.argmax(merit))
+    # Crowded matches count less for one answer against another; between hypotheses of one answer, and near ties, all
+    # matches tell the best.
+    alike = (_angles_to(hypotheses, answer) < ALTERNATIVE_DEG) | (merit > merit[answer] - TIE)
     whole = of_both[:, column, 1] + _support_bonus(residuals, weights, coefficients)
     chosen = int(np.argmax(np.where(alike, whole, -np.inf)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights

@@ -158,7 +158,7 @@ def test_what_a_match_counts_does_not_depend_on_units_or_on_which_image_is_first
 def test_a_repeated_window_does_not_outvote_the_rest_of_the_view() -> None:
     """Matches spread over the view agree with the truth; a few more, all in one place, with another pose."""
     scene = make_scene(right=60, wrong=0, noise_px=0.1)
-    other = rotation_from_vector(np.array([0.0, 0.0, 0.05])) @ scene.R
+    other = rotation_from_vector(np.array([0.0, 0.0, 0.15])) @ scene.R
     true, rng = normalized(scene), np.random.default_rng(2)
     window = np.column_stack([rng.uniform(0.2, 0.23, (70, 2)), np.zeros((70, 2))])
     rays = np.column_stack([window[:, :2], np.ones(70)]) @ other.T * 5.0 + scene.t
