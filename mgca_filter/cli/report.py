@@ -167,10 +167,10 @@ def _focal_lines(report: MatchReport) -> list[str]:
     info = report.result.info
     how_to = "--K fx,fy,cx,cy or --K FILE (K.txt, cameras.txt, OpenCV's YAML)"
     if report.intrinsics == "estimated":
-        sigma = info["focal_sigma"]
+        sigma = max(info["focal_sigma"])
         accuracy = f", good to about {100.0 * sigma:.0f} %" if sigma < _POOR_SIGMA else ", which hardly tell it"
-        found = f"focal length {info['focal_px']:.0f} px estimated from the matches{accuracy}"
-        return [f"{found}: {how_to} makes the pose surer"]
+        focal = " and ".join(dict.fromkeys(f"{focal:.0f}" for focal in info["focal_px"]))
+        return [f"focal length {focal} px estimated from the matches{accuracy}: {how_to} makes the pose surer"]
     if report.intrinsics != "guessed":
         return []
     focal = " and ".join(dict.fromkeys(f"{camera.K[0, 0]:.0f}" for camera in report.cameras))
@@ -209,7 +209,7 @@ def to_json(report: MatchReport) -> str:
         "dist2": _lens(report.dist2),
         "homography": _digits(info.get("homography")),
         "intrinsics": report.intrinsics,
-        "focal_px": _places(info.get("focal_px"), 2),
+        "focal_px": None if "focal_px" not in info else [_places(focal, 2) for focal in info["focal_px"]],
         "assumptions": list(info.get("assumptions", ())),
         "backend": info.get("backend"),
         "model": info.get("model"),
