@@ -36,7 +36,7 @@ def test_results_of_processes_stream_and_little_is_read_ahead(monkeypatch: pytes
         names = [next(results)[0]]
         time.sleep(1.0)
         assert len(read) <= 6
-        names += [name for name, _ in results]
+        names += [name for name, *_ in results]
     assert sorted(names) == sorted(f"{k}.png" for k in range(20))
 
 
