@@ -40,7 +40,8 @@ def test_killed_worker_is_replaced_and_its_pairs_repeated(paths, views):
     """The process of a worker killed in the middle: all pairs come back, with the rows of one process."""
     files = {view.name: cv2.imencode(".png", view.image)[1].tobytes() for view in views}
     alone = PairWorker({})
-    images: dict[str, ImageFeatures] = dict(alone.extract(name, data, "sift", 1000) for name, data in files.items())
+    extracted = (alone.extract(name, data, "sift", 1000) for name, data in files.items())
+    images: dict[str, ImageFeatures] = {name: features for name, features, *_ in extracted}
     pairs = [(a, b) for a in images for b in images if a < b]
     expected = {(a, b): alone.filter(a, b, images[a], images[b], None).kept.tolist() for a, b in pairs}
     with Workers({}, 2, "ray") as workers:
