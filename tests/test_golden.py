@@ -57,6 +57,9 @@ def test_answers_are_those_of_the_golden_files(case: Case) -> None:
     if not (same or expected["stable"]):
         return
     assert str(result.status) == expected["status"]
+    assert bool(result.info.get("mirrored")) == expected["mirrored"]
+    if same and expected["focal_px"] is not None:
+        np.testing.assert_allclose(result.info["focal_px"], expected["focal_px"], rtol=1e-3)
     assert iou(result.mask, mask) >= (1.0 if same else min(MIN_IOU, 1.0 - 1.5 / max(mask.sum(), 1)))
     for name in ("E", "F", "R", "t"):
         assert (getattr(result, name) is None) == (expected[name] is None)

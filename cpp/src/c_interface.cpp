@@ -421,11 +421,16 @@ double mgca_result_number(const mgca_result* result, const char* name) {
         if (word == "support") {
             return number(known.support);
         }
+        if (word == "mirrored") {
+            return known.mirrored ? 1.0 : 0.0;
+        }
+        if (word == "focal_px1" || word == "focal_px2" || word == "focal_sigma1" || word == "focal_sigma2") {
+            const std::optional<cv::Vec2d>& both = word.find("focal_px") == 0 ? known.focal_px : known.focal_sigma;
+            return both ? (*both)[word.back() - '1'] : std::numeric_limits<double>::quiet_NaN();
+        }
         const std::optional<double>* value = word == "confidence"              ? &known.confidence
                                              : word == "log10_false_alarms"    ? &known.log10_false_alarms
                                              : word == "translation_sigma_deg" ? &known.translation_sigma_deg
-                                             : word == "focal_px"              ? &known.focal_px
-                                             : word == "focal_sigma"           ? &known.focal_sigma
                                              : word == "focal_factor"          ? &known.focal_factor
                                                                                : nullptr;
         if (value == nullptr) {

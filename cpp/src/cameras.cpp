@@ -24,10 +24,21 @@ constexpr double kUndistortStep = 1e-9;
 constexpr double kUndistortedWithin = 1e-4;  // of the focal length
 // Points of a camera whose lens shows nothing at so many of them: the coefficients are those of another model.
 constexpr double kNowhereShare = 0.2;
+// No rectilinear lens is wider than this from its axis into the corner of the image, save for a few.
+constexpr double kWidestPinholeDeg = 55.0, kFarthestPercentile = 98.0;
 // Half the width of the difference that stands for a derivative.
 constexpr double kStretchStepPx = 0.25;
 
 constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+
+/// Percentile of at least one value, between neighbours by their distances, as numpy's.
+double percentile(std::vector<double> values, double percent) {
+    std::sort(values.begin(), values.end());
+    const double position = percent / 100.0 * static_cast<double>(values.size() - 1);
+    const auto lower = static_cast<std::size_t>(position);
+    const std::size_t upper = std::min(lower + 1, values.size() - 1);
+    return values[lower] + (position - static_cast<double>(lower)) * (values[upper] - values[lower]);
+}
 
 cv::Point2d normalize_point(const cv::Point2d& point, const cv::Matx33d& K) {
     const double y = (point.y - K(1, 2)) / K(1, 1);
@@ -270,18 +281,26 @@ std::string lens_doubt(const Intrinsics& camera, const std::vector<cv::Point2d>&
     if (!camera.distorts() || finite.empty()) {
         return "";
     }
-    const std::vector<cv::Point2d> normalized = camera.normalize(finite);
-    const auto nowhere = std::count_if(normalized.begin(), normalized.end(),
-                                       [](const cv::Point2d& x) { return std::isnan(x.x) || std::isnan(x.y); });
-    const double share = static_cast<double>(nowhere) / static_cast<double>(finite.size());
-    if (share <= kNowhereShare) {
-        return "";
+    std::vector<double> radii;
+    for (const cv::Point2d& x : camera.normalize(finite)) {
+        if (!std::isnan(x.x) && !std::isnan(x.y)) {
+            radii.push_back(cv::norm(x));
+        }
     }
     const std::string number = std::to_string(image);
+    const std::string advice = "; if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)";
     const bool plain = !camera.fisheye && camera.distortion.size() == 4;
-    return "dist" + number + " shows nothing at " + std::to_string(std::llround(100.0 * share)) +
-           " % of the keypoints of image " + number +
-           (plain ? "; if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)" : "");
+    const double share = 1.0 - static_cast<double>(radii.size()) / static_cast<double>(finite.size());
+    if (share > kNowhereShare) {
+        return "dist" + number + " shows nothing at " + std::to_string(std::llround(100.0 * share)) +
+               " % of the keypoints of image " + number + (plain ? advice : "");
+    }
+    const double angle_deg = std::atan(percentile(radii, kFarthestPercentile)) * 180.0 / CV_PI;
+    if (plain && angle_deg > kWidestPinholeDeg) {
+        return "the four coefficients of dist" + number + " are read as a pinhole's, and keypoints of image " + number +
+               " lie up to " + std::to_string(std::llround(angle_deg)) + "° off its axis" + advice;
+    }
+    return "";
 }
 
 double mean_focal_length(const cv::Matx33d& K1, const cv::Matx33d& K2) {

@@ -44,7 +44,9 @@ std::pair<Intrinsics, Intrinsics> resolve_intrinsics(const std::vector<cv::Point
                                                      const std::vector<cv::Point2d>& points2, const Camera& camera1,
                                                      const Camera& camera2);
 
-/// One sentence where the lens of a camera shows nothing at many of the keypoints of its image, or an empty one.
+/// One sentence where the lens of a camera can hardly be meant so, or an empty one: it shows nothing at many of the
+/// keypoints of its image, or four coefficients, legal for OpenCV's pinhole and fisheye model alike, are read as a
+/// pinhole's that sees further to the side than such lenses do.
 std::string lens_doubt(const Intrinsics& camera, const std::vector<cv::Point2d>& points, int image);
 
 /// Mean of the four focal lengths, pixels: what converts pixel thresholds to the normalised plane.

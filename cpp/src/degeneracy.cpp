@@ -14,8 +14,6 @@ constexpr double kExplainedShare = 0.95, kExplainedThresholdFactor = 2.0, kMaxAc
 constexpr std::size_t kChanceRows = 400;
 constexpr int kTrimRounds = 5;
 constexpr int kModelFreedom = 5;
-// The median of absolute normal deviates times this is their sigma.
-constexpr double kToSigma = 1.4826;
 // A match this many sigmas off counts no more than that.
 constexpr double kGricCut = 5.0, kPriceOfDimension = 2.2;
 

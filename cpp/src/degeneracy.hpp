@@ -12,8 +12,9 @@ constexpr int kMinSupport = 13;
 // Number of false alarms, log10: above the first the support is chance, above the second it is weak.
 constexpr double kUnrelatedLog10Nfa = 0.5, kLowSupportLog10Nfa = -1.0;
 constexpr double kIntrinsicsSupportFactor = 1.5;
-// Keypoints are not better than this.
+// Keypoints are not better than this, and the median of absolute normal deviates times the second is their sigma.
 constexpr double kLeastNoisePx = 0.1;
+constexpr double kToSigma = 1.4826;
 
 /// How well the fitted matches stand behind the model.
 struct Support {

@@ -2,6 +2,7 @@
 
 #include "embedded_model.hpp"
 #include "focal_estimate.hpp"
+#include "mirror.hpp"
 #include "model_file.hpp"
 #include "network.hpp"
 #include "robust_fit.hpp"
@@ -14,6 +15,8 @@
 #include <algorithm>
 #include <cmath>
 #include <initializer_list>
+#include <iomanip>
+#include <sstream>
 #include <string_view>
 #include <utility>
 
@@ -74,6 +77,30 @@ detail::Mask keep_by_scores(const detail::PairInput& pair, const std::vector<flo
         kept[i] = scores[i] > 0.5F && pair.valid[i] != 0 ? 1 : 0;
     }
     return kept;
+}
+
+cv::Matx33d zoom_of(double factor) { return cv::Matx33d::diag({factor, factor, 1.0}); }
+
+/// What was assumed of the cameras whose focal lengths were estimated.
+std::vector<std::string> focal_sentences(const cv::Vec2d& focal_px, const cv::Vec2d& sigmas) {
+    const auto sentence = [&](int i, const char* whose) {
+        return "focal length " + std::to_string(std::llround(focal_px[i])) + " px of " + whose +
+               " estimated from the matches, to " + std::to_string(std::llround(100.0 * sigmas[i])) + " %";
+    };
+    if (focal_px[0] == focal_px[1]) {
+        return {sentence(0, "both images")};
+    }
+    return {sentence(0, "image 1"), sentence(1, "image 2")};
+}
+
+/// Why a mask of that precision is empty.
+std::string empty_sentence(double precision, const std::vector<float>& scores) {
+    const float best = scores.empty() ? 0.0F : *std::max_element(scores.begin(), scores.end());
+    std::ostringstream sentence;
+    sentence << "keep_precision=" << precision << " keeps no match, for the best score is " << std::fixed
+             << std::setprecision(2) << std::max(best, 0.0F)
+             << ": the status speaks of the geometry alone; a threshold keeps what agrees with it";
+    return sentence.str();
 }
 
 template <typename Value>
@@ -224,23 +251,23 @@ Result Filter::operator()(const MatchPair& matches) const {
             model = search->with_network(*evidence);
         }
         if (model && !given && options_.geometry == Geometry::automatic) {
-            // A second fit, of an essential matrix, where the matches tell the focal length that was guessed.
-            focal = detail::estimate_focal(*evidence, model->M);
-        }
-        if (focal) {
-            detail::PairInput zoomed = pair.with_focal(focal->factor);
-            const cv::Matx33d zoom = cv::Matx33d::diag({focal->factor, focal->factor, 1.0});
-            const cv::Matx33d E =
-                detail::usable(essential) ? detail::project_to_essential(zoom * essential * zoom) : essential;
-            detail::Evidence scored = detail::gather_scored(zoomed, sent, result.scores, margins, E);
-            detail::Search again(detail::gather_before(zoomed), metadata.choice, options_);
-            auto better = again.with_network(scored);
-            if (better && detail::agrees_as_well(scored, *better, *evidence, *model)) {
-                pair = std::move(zoomed);
-                evidence = std::move(scored);
-                model = std::move(better);
-            } else {
-                focal.reset();
+            // A second fit, of an essential matrix, where the matches tell the focal lengths that were guessed.
+            for (const detail::FocalEstimate& estimate : detail::estimate_focals(*evidence, model->M)) {
+                detail::PairInput zoomed = pair.with_focals(estimate.factors);
+                const cv::Matx33d E =
+                    detail::usable(essential)
+                        ? detail::project_to_essential(zoom_of(estimate.factors[1]) * essential * zoom_of(estimate.factors[0]))
+                        : essential;
+                detail::Evidence scored = detail::gather_scored(zoomed, sent, result.scores, margins, E);
+                detail::Search again(detail::gather_before(zoomed), metadata.choice, options_);
+                auto better = again.with_network(scored);
+                if (better && detail::agrees_as_well(scored, *better, *evidence, *model)) {
+                    pair = std::move(zoomed);
+                    evidence = std::move(scored);
+                    model = std::move(better);
+                    focal = estimate;
+                    break;
+                }
             }
         }
     }
@@ -262,6 +289,12 @@ Result Filter::operator()(const MatchPair& matches) const {
             verdict.R.reset();
             verdict.t.reset();
         }
+        if (!given && !focal && options_.geometry == Geometry::automatic && verdict.t) {
+            verdict.E.reset();  // nor do matches that no focal length explains
+            verdict.R.reset();
+            verdict.t.reset();
+        }
+        verdict = detail::judge_mirror(pair, *evidence, std::move(verdict), threshold_px, options_);
         if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }
@@ -280,15 +313,20 @@ Result Filter::operator()(const MatchPair& matches) const {
     result.assumptions = pair.assumptions;
     if (focal) {
         result.intrinsics = IntrinsicsSource::estimated;
-        result.focal_px = pair.focal_px() / pair.unit_px;
-        result.focal_sigma = focal->sigma;
-        result.assumptions.push_back("focal length " + std::to_string(std::llround(*result.focal_px)) +
-                                     " px of both images estimated from the matches, to " +
-                                     std::to_string(std::llround(100.0 * focal->sigma)) + " %");
+        const cv::Matx33d &K1 = pair.intrinsics1.K, &K2 = pair.intrinsics2.K;
+        result.focal_px = cv::Vec2d(detail::mean_focal_length(K1, K1), detail::mean_focal_length(K2, K2)) / pair.unit_px;
+        result.focal_sigma = focal->sigmas;
+        for (std::string& sentence : focal_sentences(*result.focal_px, focal->sigmas)) {
+            result.assumptions.push_back(std::move(sentence));
+        }
+    }
+    if (verdict.mirrored) {
+        result.assumptions.push_back("one of the images is mirrored: the matches agree with a view that no camera has");
     }
     result.translation_sigma_deg = verdict.translation_sigma_deg;
     result.status = verdict.status;
     result.mask = std::move(verdict.mask);
+    result.mirrored = verdict.mirrored;
     result.num_inliers = static_cast<int>(std::count(result.mask.begin(), result.mask.end(), 1));
     result.E = verdict.E;
     result.F = verdict.F;
@@ -298,6 +336,9 @@ Result Filter::operator()(const MatchPair& matches) const {
     result.support = verdict.support;
     result.log10_false_alarms = verdict.log10_false_alarms;
     result.focal_factor = verdict.focal_factor;
+    if (options_.keep_precision && result.num_inliers == 0 && (result.F || result.R || result.H)) {
+        result.assumptions.push_back(empty_sentence(*options_.keep_precision, result.scores));
+    }
     return result;
 }
 

@@ -1,11 +1,14 @@
 #include "focal_estimate.hpp"
 
+#include "focal_pair.hpp"
 #include "pose_refinement.hpp"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <limits>
+#include <optional>
+#include <utility>
 
 namespace mgca::detail {
 namespace {
@@ -22,6 +25,8 @@ constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
 constexpr double kReachPx = 16.0;
 constexpr int kRounds = 6;
 constexpr std::size_t kMaxRows = 300, kMinRows = 12;
+// Keypoints are not better than this.
+constexpr double kBestNoisePx = 0.1;
 // With this share of the matches that agree with F an essential matrix takes its place.
 constexpr double kLeastAgreement = 0.8;
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
@@ -36,8 +41,17 @@ Correspondences agreeing_with(const Evidence& evidence, const cv::Matx33d& M) {
     return agreeing;
 }
 
-/// Truncated squared Sampson errors in squared pixels, summed, of the best pose under a factor on the guess.
-double cost_px(const Correspondences& rows, const cv::Matx33d& F, double factor, double focal_px) {
+using FactorGrid = std::array<double, kFactors>;
+
+/// The best pose under a factor, if there is one, and the squared Sampson errors that it leaves, each cut off, summed, in
+/// squared pixels.
+struct FocalTrial {
+    std::optional<Pose> pose;
+    double cost_px = kInfinity;
+};
+
+/// The pose that suits a factor on the guess, from F.
+FocalTrial pose_under(const Correspondences& rows, const cv::Matx33d& F, double factor, double focal_px) {
     const cv::Matx33d zoom = cv::Matx33d::diag({factor, factor, 1.0});
     Correspondences scaled;
     for (const Correspondence& row : rows) {
@@ -46,17 +60,53 @@ double cost_px(const Correspondences& rows, const cv::Matx33d& F, double factor,
     const double focal = focal_px * factor;
     const auto start = pose_from_essential(project_to_essential(zoom * F * zoom), scaled, focal / kReachPx);
     if (!start) {
-        return kInfinity;
+        return {};
     }
     const double threshold = kThresholdPx / focal;
     const Pose pose =
         refine_pose(scaled, refine_pose(scaled, *start, kReachPx / focal, kRounds), threshold, kRounds);
-    return truncated_cost(scaled, pose, threshold) * focal * focal;
+    return {pose, truncated_cost(scaled, pose, threshold) * focal * focal};
+}
+
+/// The factor that both images share, and the position of the nearest on the grid.
+///
+/// @param costs in squared pixels, over the grid. count: number of matches behind them.
+std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorGrid& logs, FactorGrid costs, std::size_t count) {
+    double least = kInfinity;
+    for (const double cost : costs) {
+        least = std::isfinite(cost) ? std::min(least, cost) : least;
+    }
+    if (!std::isfinite(least)) {
+        return {std::nullopt, 0};
+    }
+    // The noise is what the best of them leaves.
+    const double noise = std::max(least / static_cast<double>(count), kBestNoisePx * kBestNoisePx);
+    for (std::size_t i = 0; i < kFactors; ++i) {
+        const double unusual = (logs[i] - kUsual) / kUsualSpread;
+        costs[i] = std::isfinite(costs[i]) ? costs[i] / noise + unusual * unusual : kInfinity;
+    }
+    const auto lowest = static_cast<std::size_t>(std::min_element(costs.begin(), costs.end()) - costs.begin());
+    const std::size_t best = std::clamp<std::size_t>(lowest, 1, kFactors - 2);
+    const double before = costs[best - 1], at = costs[best], after = costs[best + 1];
+    if (!std::isfinite(before) || !std::isfinite(at) || !std::isfinite(after)) {
+        return {std::nullopt, best};
+    }
+    // A parabola through three points of equal distance.
+    const double width = logs[best + 1] - logs[best];
+    const double curvature = (before - 2.0 * at + after) / (2.0 * width * width);
+    const double slope = (after - before) / (2.0 * width);
+    if (!(curvature > 0.0)) {
+        return {std::nullopt, best};
+    }
+    const double log_factor = std::clamp(logs[best] - slope / (2.0 * curvature), logs[best - 1], logs[best + 1]);
+    // A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
+    const double sigma = std::hypot(kSigmaFactor / std::sqrt(curvature), kLeastSigma);
+    return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma)}, best};
 }
 
 }  // namespace
 
-std::optional<FocalEstimate> estimate_focal(const Evidence& evidence, const cv::Matx33d& F) {
+std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::Matx33d& F) {
     const Correspondences agreeing = agreeing_with(evidence, F);
     const std::size_t step = std::max<std::size_t>(1, (agreeing.size() + kMaxRows - 1) / kMaxRows);
     Correspondences rows;
@@ -64,41 +114,35 @@ std::optional<FocalEstimate> estimate_focal(const Evidence& evidence, const cv::
         rows.push_back(agreeing[i]);
     }
     if (rows.size() < kMinRows) {
-        return std::nullopt;
+        return {};
     }
-    std::array<double, kFactors> logs{}, costs{};
-    double least = kInfinity;
+    FactorGrid logs{}, costs{};
+    std::array<FocalTrial, kFactors> trials;
     for (std::size_t i = 0; i < kFactors; ++i) {
         const double part = static_cast<double>(i) / (kFactors - 1);
         logs[i] = std::log(kSmallestFactor) + part * std::log(kLargestFactor / kSmallestFactor);
-        costs[i] = cost_px(rows, F, std::exp(logs[i]), evidence.focal_px);
-        least = std::min(least, costs[i]);
+        trials[i] = pose_under(rows, F, std::exp(logs[i]), evidence.focal_px);
+        costs[i] = trials[i].cost_px;
     }
-    if (!std::isfinite(least)) {
-        return std::nullopt;
+    const auto [shared, best] = shared_factor(logs, costs, rows.size());
+    std::vector<FocalEstimate> estimates;
+    if (trials[best].pose && std::isfinite(costs[best])) {
+        double sum = 0.0;
+        for (const double distance : sampson_distances(agreeing, F)) {
+            sum += distance * distance;
+        }
+        const double noise =
+            std::max(std::sqrt(sum / static_cast<double>(agreeing.size())), kBestNoisePx / evidence.focal_px);
+        const FocalPairFit fit(rows, kThresholdPx / evidence.focal_px, noise, {kUsual, kUsualSpread});
+        if (const auto two = fit.differing(*trials[best].pose, logs[best])) {
+            estimates.push_back({{std::exp(two->logs[0]), std::exp(two->logs[1])},
+                                 {std::hypot(two->sigmas[0], kLeastSigma), std::hypot(two->sigmas[1], kLeastSigma)}});
+        }
     }
-    // The noise is what the best of them leaves.
-    const double noise = std::max(least / static_cast<double>(rows.size()), 0.1 * 0.1);
-    for (std::size_t i = 0; i < kFactors; ++i) {
-        const double unusual = (logs[i] - kUsual) / kUsualSpread;
-        costs[i] = costs[i] / noise + unusual * unusual;
+    if (shared) {
+        estimates.push_back(*shared);
     }
-    const auto lowest = static_cast<std::size_t>(std::min_element(costs.begin(), costs.end()) - costs.begin());
-    const std::size_t best = std::clamp<std::size_t>(lowest, 1, kFactors - 2);
-    const double before = costs[best - 1], at = costs[best], after = costs[best + 1];
-    if (!std::isfinite(before) || !std::isfinite(at) || !std::isfinite(after)) {
-        return std::nullopt;
-    }
-    // A parabola through three points of equal distance.
-    const double width = logs[best + 1] - logs[best];
-    const double curvature = (before - 2.0 * at + after) / (2.0 * width * width);
-    const double slope = (after - before) / (2.0 * width);
-    if (!(curvature > 0.0)) {
-        return std::nullopt;
-    }
-    const double log_factor = std::clamp(logs[best] - slope / (2.0 * curvature), logs[best - 1], logs[best + 1]);
-    // A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
-    return FocalEstimate{std::exp(log_factor), std::hypot(kSigmaFactor / std::sqrt(curvature), kLeastSigma)};
+    return estimates;
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -1,23 +1,26 @@
-// A focal length that both images share, from their matches alone; mgca_filter/fit/focal_estimate.py.
+// Focal lengths of both images from their matches alone: those under which a pose agrees best;
+// mgca_filter/fit/focal_estimate.py.
 
 #pragma once
 
 #include "evidence.hpp"
 #include "robust_fit.hpp"
 
-#include <optional>
+#include <vector>
 
 namespace mgca::detail {
 
+/// Focal lengths of both images.
 struct FocalEstimate {
-    double factor;  // on the guessed one
-    double sigma;   // standard deviation of its logarithm
+    cv::Vec2d factors;  // on the guessed ones, of image 1 and 2; equal where both images share the factor
+    cv::Vec2d sigmas;   // standard deviations of their logarithms: 0.1 is ten per cent
 };
 
-/// The focal length under which the matches agree best with a pose; nothing where they are few.
+/// The focal lengths under which the matches agree best with a pose, the most plausible first: two different factors where
+/// the matches ask for them, then one that both images share; none where the matches are few.
 ///
-/// @param evidence scored matches on the image planes normalised by the guessed focal length. F: in the same coordinates.
-std::optional<FocalEstimate> estimate_focal(const Evidence& evidence, const cv::Matx33d& F);
+/// @param evidence scored matches on the image planes normalised by the guessed focal lengths. F: in the same coordinates.
+std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::Matx33d& F);
 
 /// True where nearly as many matches agree with an essential matrix as with the F that knows no intrinsics.
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -287,7 +287,7 @@ private:
         };
         const cv::Matx33d triangle1 = triangle(false), triangle2 = triangle(true);
         const double det1 = cv::determinant(triangle1), det2 = cv::determinant(triangle2);
-        if (!(std::abs(det1) > 1e-12) || !(std::abs(det2) > 1e-12) || !(det1 * det2 > 0.0)) {
+        if (!(std::abs(det1) > 1e-12) || !(std::abs(det2) > 1e-12) || !(options_.reflection || det1 * det2 > 0.0)) {
             return std::nullopt;
         }
         const cv::Matx33d inverse1 = triangle1.inv();
@@ -351,6 +351,7 @@ private:
     /// False where a map mirrors, collapses or stretches the inliers as no plane does.
     bool possible(const cv::Matx33d& H) const {
         int near = 0;
+        double orientation = 1.0;
         for (const Correspondence& row : rows_) {
             const Residual residual(row, H);
             if (!(residual.squared < threshold_ * threshold_)) {
@@ -362,7 +363,10 @@ private:
             const cv::Matx22d frame((H(0, 0) - x * H(2, 0)) / residual.w, (H(0, 1) - x * H(2, 1)) / residual.w,
                                     (H(1, 0) - y * H(2, 0)) / residual.w, (H(1, 1) - y * H(2, 1)) / residual.w);
             // Singular values of a 2x2 matrix from its norm and determinant.
-            const double determinant = cv::determinant(frame), norm = frame.ddot(frame);
+            if (near == 1 && options_.reflection) {
+                orientation = std::copysign(1.0, cv::determinant(frame));
+            }
+            const double determinant = orientation * cv::determinant(frame), norm = frame.ddot(frame);
             const double root = std::sqrt(std::max(norm * norm - 4.0 * determinant * determinant, 0.0));
             const double largest = std::sqrt(0.5 * (norm + root)), smallest = determinant / largest;
             if (!(determinant > 0.0) || !(largest < kMaxStretch) || !(smallest > 1.0 / kMaxStretch)) {

@@ -18,6 +18,7 @@ struct HomographyOptions {
     double confidence = 0.9999;
     int max_iterations = 5000;
     int seed = 0;
+    bool reflection = false;  // maps that mirror are possible, too
 };
 
 /// Homography with p2 ~ H p1 and H(2, 2) = 1 that most of the weight of the matches supports, polished by least squares.

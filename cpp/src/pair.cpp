@@ -181,12 +181,13 @@ std::vector<cv::Matx22d> stretch_of_matches(const Intrinsics& camera, const std:
 
 }  // namespace
 
-PairInput PairInput::with_focal(double factor) const {
+PairInput PairInput::with_focals(const cv::Vec2d& factors) const {
     PairInput zoomed = *this;
     for (Correspondence& match : zoomed.correspondences) {
-        match /= factor;
+        match = {match[0] / factors[0], match[1] / factors[0], match[2] / factors[1], match[3] / factors[1]};
     }
-    for (Intrinsics* camera : {&zoomed.intrinsics1, &zoomed.intrinsics2}) {
+    for (const auto& [camera, factor] :
+         {std::pair{&zoomed.intrinsics1, factors[0]}, std::pair{&zoomed.intrinsics2, factors[1]}}) {
         for (const auto& [row, column] : {std::pair{0, 0}, std::pair{0, 1}, std::pair{1, 1}}) {
             camera->K(row, column) *= factor;
         }

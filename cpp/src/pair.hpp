@@ -30,8 +30,8 @@ struct PairInput {
     bool calibrated() const { return !intrinsics1.guessed; }
     double focal_px() const { return mean_focal_length(intrinsics1.K, intrinsics2.K); }
 
-    /// The pair under the guessed focal length times a factor, taken for the truth from now on.
-    PairInput with_focal(double factor) const;
+    /// The pair under the guessed focal lengths times factors, one an image, taken for the truth from now on.
+    PairInput with_focals(const cv::Vec2d& factors) const;
 
     /// Sampson distance of a match to E in pixels as they were found: through a lens its derivative counts.
     double epipolar_distance_px(std::size_t row, const cv::Matx33d& E) const;

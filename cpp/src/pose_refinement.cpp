@@ -16,6 +16,10 @@ constexpr double kConvergedDecrease = 1e-4;
 // Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 constexpr double kReach = 12.0;
 
+// Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
+constexpr double kLinearDeg = 0.1;
+constexpr std::size_t kRings = 28, kSpokes = 12, kSpreadRows = 200;
+
 using Vec5d = cv::Vec<double, 5>;
 using Matx55d = cv::Matx<double, 5, 5>;
 
@@ -109,6 +113,64 @@ struct NormalEquations {
     }
 };
 
+/// Summed squared Sampson distances of matches to a pose with another direction of translation, the rotation moved from
+/// the pose's as that likes best, to first order.
+double cost_of_direction(const Correspondences& matches, const Pose& pose) {
+    cv::Matx33d hessian = kSmallestCurvature * cv::Matx33d::eye();
+    cv::Vec3d gradient;
+    double cost = 0.0;
+    for (const Correspondence& match : matches) {
+        const SampsonTerm term(match, pose);
+        const double scale = 1.0 / std::sqrt(term.squared_norm), residual = term.error * scale;
+        const cv::Vec3d row =
+            scale * cv::Vec3d(term.r0, term.r1, term.r2).cross(cv::Vec3d(term.n0, term.n1, term.n2));
+        hessian += row * row.t();
+        gradient += residual * row;
+        cost += residual * residual;
+    }
+    return cost - gradient.dot(hessian.solve(gradient, cv::DECOMP_LU));
+}
+
+/// Standard deviation of the direction of translation from the likelihoods of directions on rings around t, from a
+/// fraction of `scale_deg` to 90 degrees.
+double direction_spread_deg(const Correspondences& inliers, const Pose& pose, double noise, double scale_deg) {
+    const std::size_t step = std::max<std::size_t>(1, (inliers.size() + kSpreadRows - 1) / kSpreadRows);
+    Correspondences rows;
+    for (std::size_t i = 0; i < inliers.size(); i += step) {
+        rows.push_back(inliers[i]);
+    }
+    const auto basis = tangent_basis(pose.t);
+    const double best = cost_of_direction(rows, pose), smallest = std::min(0.2 * scale_deg, 1.0) * CV_PI / 180.0;
+    std::vector<double> log_weights;
+    std::vector<cv::Vec2d> moves;
+    double inner = 0.0;
+    for (std::size_t ring = 0; ring < kRings; ++ring) {
+        const double part = static_cast<double>(ring) / (kRings - 1);
+        const double outer = smallest * std::pow(0.5 * CV_PI / smallest, part), angle = 0.5 * (outer + inner);
+        for (std::size_t spoke = 0; spoke < kSpokes; ++spoke) {
+            const double turn = 2.0 * CV_PI * static_cast<double>(spoke) / kSpokes;
+            const cv::Vec2d across(std::cos(turn), std::sin(turn));
+            const cv::Vec3d t =
+                std::cos(angle) * pose.t + std::sin(angle) * (across[0] * basis[0] + across[1] * basis[1]);
+            const double cost = static_cast<double>(step) * (cost_of_direction(rows, {pose.R, t}) - best);
+            log_weights.push_back(-0.5 * cost / (noise * noise) + std::log(std::sin(angle) * (outer - inner)));
+            moves.push_back(angle * across);
+        }
+        inner = outer;
+    }
+    const double largest = *std::max_element(log_weights.begin(), log_weights.end());
+    cv::Matx22d moments;
+    double sum = 0.0;
+    for (std::size_t i = 0; i < moves.size(); ++i) {
+        const double weight = std::exp(log_weights[i] - largest);
+        moments += weight * (moves[i] * moves[i].t());
+        sum += weight;
+    }
+    cv::Matx21d eigenvalues;  // in descending order
+    cv::eigen(moments * (1.0 / sum), eigenvalues);
+    return std::min(std::sqrt(eigenvalues(0)) * 180.0 / CV_PI, 90.0);
+}
+
 }  // namespace
 
 double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold) {
@@ -177,7 +239,8 @@ double direction_uncertainty_deg(const Correspondences& inliers, const Pose& pos
         equations.hessian.get_minor<2, 2>(3, 3) - cross.t() * rotation.solve(cross, cv::DECOMP_LU);
     cv::Matx21d eigenvalues;
     cv::eigen(marginal, eigenvalues);
-    return std::min(noise / std::sqrt(std::max(eigenvalues(1), 1e-18)) * 180.0 / CV_PI, 90.0);
+    const double linear_deg = std::min(noise / std::sqrt(std::max(eigenvalues(1), 1e-18)) * 180.0 / CV_PI, 90.0);
+    return linear_deg < kLinearDeg ? linear_deg : direction_spread_deg(inliers, pose, noise, linear_deg);
 }
 
 double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise) {

@@ -25,7 +25,9 @@ double truncated_cost(const Correspondences& matches, const Pose& pose, double t
 /// @param noise standard deviation of the Sampson distance, normalised.
 double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise);
 
-/// The same of the direction of translation alone; what the rotation takes up of the same residuals is accounted for.
+/// The same of the direction of translation alone, at most 90: from the curvature where that says that it is small, else
+/// from the likelihoods of directions all around, for over a few pixels of parallax the cost is no paraboloid. What the
+/// rotation takes up of the same residuals is accounted for.
 double direction_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise);
 
 /// Rotation about a vector by its length in radians (Rodrigues).

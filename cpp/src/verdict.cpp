@@ -255,7 +255,8 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
         verdict.status = Status::unrelated;
         return plane_or(verdict, pair, evidence, mask_threshold_px, options);
     }
-    const double noise = std::max(median(sampson_distances(inliers, model->M)), kLeastNoisePx / pair.focal_px());
+    const double residual = median(sampson_distances(inliers, model->M));
+    const double noise = std::max(kToSigma * residual, kLeastNoisePx / pair.focal_px());
     verdict.translation_sigma_deg = direction_uncertainty_deg(inliers, model->pose, noise);
     keep_model(pair, *model, mask_threshold_px, verdict);
     if (suspicious) {

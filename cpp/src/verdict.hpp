@@ -20,6 +20,7 @@ struct Verdict {
     std::optional<cv::Matx33d> H;
     std::optional<int> support;
     std::optional<double> log10_false_alarms, focal_factor, translation_sigma_deg;
+    bool mirrored = false;
 };
 
 /// Re-test all matches against the model and decide what it is worth.

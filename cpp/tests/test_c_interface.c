@@ -71,7 +71,9 @@ static void finds_the_pose(const mgca_filter *filter) {
     check(mgca_result_matrix(result, "H") == NULL, "no H");
     check(mgca_result_number(result, "confidence") > 0.5, "confidence");
     check(mgca_result_number(result, "num_accepted") > 0.8 * RIGHT, "num_accepted");
-    check(isnan(mgca_result_number(result, "focal_px")), "no focal length is estimated");
+    check(isnan(mgca_result_number(result, "focal_px1")) && isnan(mgca_result_number(result, "focal_sigma2")),
+          "no focal length is estimated");
+    check(mgca_result_number(result, "mirrored") == 0.0, "no image is mirrored");
     check(strcmp(mgca_result_word(result, "intrinsics"), "given") == 0, "intrinsics");
     check(strlen(mgca_result_word(result, "origin")) > 0, "origin");
     check(strlen(mgca_result_word(result, "ended")) > 0, "ended");

@@ -142,6 +142,16 @@ private:
             result_.focal_factor) {
             check::near(*result_.focal_factor, expected_["focal_factor"].number(), 1e-6, name_ + ": focal factor");
         }
+        check::equal(result_.mirrored, expected_["mirrored"].boolean(), name_ + ": mirrored");
+        if (exact_ || result_.status == mgca::Status::ok) {
+            pair_of("focal_px", result_.focal_px, exact_ ? 0.002 : 0.05);
+            pair_of("focal_sigma", result_.focal_sigma, exact_ ? 0.01 : 0.2);
+        }
+        if (exact_ && result_.t && result_.intrinsics != mgca::IntrinsicsSource::guessed) {
+            const double expected = expected_["translation_sigma_deg"].number();
+            check::near(result_.translation_sigma_deg.value_or(-1.0), expected, 0.02 * expected,
+                        name_ + ": translation_sigma_deg");
+        }
         if (exact_ && expected_.has("ended") && result_.status != mgca::Status::pure_rotation) {
             check::equal(result_.ended, expected_["ended"].text(), name_ + ": ended");
         }
@@ -149,6 +159,17 @@ private:
         if (exact_ && expected_.has("support") && expected_.has("ended")) {
             check::equal(result_.support.value_or(-1), static_cast<int>(expected_["support"].number()),
                          name_ + ": support");
+        }
+    }
+
+    /// A value of each image, within a share of the expected one.
+    void pair_of(const char* name, const std::optional<cv::Vec2d>& given, double share) const {
+        if (check::equal(given.has_value(), expected_.has(name), name_ + ": " + name + " is given") && given) {
+            const std::vector<double> both = expected_[name].numbers();
+            for (int i = 0; i < 2; ++i) {
+                const double wanted = both[static_cast<std::size_t>(i)];
+                check::near((*given)[i], wanted, share * wanted, name_ + ": " + name);
+            }
         }
     }
 

@@ -166,4 +166,8 @@ def describe(result: FilterResult) -> dict[str, Any]:
         "assumptions": result.info["assumptions"],
         "support": result.info.get("support"),
         "focal_factor": result.info.get("focal_factor"),
+        "focal_px": numbers(result.info.get("focal_px")),
+        "focal_sigma": numbers(result.info.get("focal_sigma")),
+        "translation_sigma_deg": result.info.get("translation_sigma_deg"),
+        "mirrored": bool(result.info.get("mirrored")),
     }

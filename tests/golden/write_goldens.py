@@ -32,6 +32,7 @@ from mgca_filter.geometry.pose_refinement import rotation_from_vector  # noqa: E
 
 ROOT = HERE.parent.parent
 K2 = np.array([[700.0, 0.0, 310.0], [0.0, 710.0, 250.0], [0.0, 0.0, 1.0]])
+SHORT = np.array([[150.0, 0.0, 319.5], [0.0, 150.0, 239.5], [0.0, 0.0, 1.0]])
 WRONG = np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]])
 # Numbers of right matches among 300 wrong ones from which the filter begins to believe.
 FAINT = (6, 13, 16)
@@ -114,6 +115,9 @@ def synthetic_inputs() -> list[GoldenInput]:
     ratio = np.round(np.asarray(general.attributes.ratio, dtype=np.float64), 4).tolist()
     ambiguous = [[*row[:1], (row[1] + 7) % 40, *row[2:]] if i % 3 == 0 else row for i, row in enumerate(rows)]
     line = make_scene("collinear", 150, 20, seed=1)
+    skew = make_scene("skew", 300, 60)
+    zoomed = replace(skew, points2=(skew.points2 - K[:2, 2]) * 1.6 + K[:2, 2])
+    sizes = {"size1": list(SIZE), "size2": list(SIZE)}
     return [
         knn,
         from_scene("wide", wide, **camera),
@@ -147,7 +151,25 @@ def synthetic_inputs() -> list[GoldenInput]:
         change(knn, "empty", matches=[]),
         change(unlisted, "all_equal", keypoints1=[[100.0, 100.0]] * len(ratio), keypoints2=[[90.0, 80.0]] * len(ratio)),
         normalised("normalised", general),
+        from_scene("two_focal_lengths", zoomed, **sizes),
+        from_scene("mirrored_plane", flipped(planar), **camera),
+        from_scene("mirrored_guessed", flipped(planar), **sizes),
+        from_scene("mirrored_scene", flipped(make_scene("wide")), **camera),
+        from_scene("far_to_the_side", general, K1=SHORT.tolist(), dist1=FISHEYE),
+        from_scene("small_motion", small_motion(), **camera),
     ]
+
+
+def flipped(scene: Any) -> Any:
+    """The scene with its second image mirrored left to right."""
+    return replace(scene, points2=scene.points2 * np.array([-1.0, 1.0]) + np.array([SIZE[0] - 1.0, 0.0]))
+
+
+def small_motion() -> Any:
+    """A few pixels of parallax, so that the direction of translation is loose."""
+    scene = make_scene("general", 150, 60, seed=6)
+    turned = make_scene("rotation", 150, 60, seed=6)
+    return replace(scene, points2=turned.points2 + 0.05 * (scene.points2 - turned.points2))
 
 
 def faint(right: int) -> Any:
@@ -208,6 +230,7 @@ def cases(inputs: Sequence[GoldenInput]) -> list[Case]:
         "none": {"method": "none"},
         "none_precision": {"method": "none", "keep_precision": 0.8},
         "precision": {"keep_precision": 0.9},
+        "precision_empty": {"keep_precision": 0.99999},
         "threshold": {"threshold": 0.4},
         "confidence": {"confidence": 0.5},
         "iterations": {"max_iterations": 30},
@@ -219,6 +242,7 @@ def cases(inputs: Sequence[GoldenInput]) -> list[Case]:
     return [
         *listed,
         Case("planar_homography", "planar", {"geometry": "homography"}),
+        Case("mirrored_homography", "mirrored_plane", {"geometry": "homography"}),
         Case("unrelated_homography", "unrelated", {"geometry": "homography"}),
         Case("guessed_fundamental", "guessed_by_size", {"geometry": "fundamental"}),
         Case("general_full", "general", {"effort": "full"}),

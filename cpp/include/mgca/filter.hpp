@@ -190,7 +190,8 @@ struct Fisheye {
     double k1 = 0.0, k2 = 0.0, k3 = 0.0, k4 = 0.0;
 };
 
-/// Camera of one image. Everything may be unknown: without K the focal length is guessed and F is the model to trust.
+/// Camera of one image. Everything may be unknown: without K the focal lengths are estimated from the matches, one or,
+/// where they ask for it, two; where that fails F comes without E, R and t.
 struct Camera {
     Camera() = default;
     Camera(const cv::Matx33d& intrinsics, std::vector<double> distortion_coefficients = {},  // NOLINT: implicit
@@ -240,8 +241,9 @@ struct Result {
     std::optional<cv::Matx33d> H;  ///< Homography that explains the pair, or was asked for; H(2, 2) = 1.
 
     IntrinsicsSource intrinsics = IntrinsicsSource::given;
-    std::optional<double> focal_px;             ///< Estimated focal length, pixels, and its relative standard deviation.
-    std::optional<double> focal_sigma;
+    /// Estimated focal lengths of both images, pixels, equal unless the matches ask for two.
+    std::optional<cv::Vec2d> focal_px;
+    std::optional<cv::Vec2d> focal_sigma;       ///< Their relative standard deviations.
     std::vector<std::string> assumptions;       ///< Sentences on what was assumed.
     int num_accepted = 0;                       ///< Matches whose logit is above the model's decision threshold.
     std::optional<cv::Matx33d> network_essential;  ///< Essential matrix as the network gave it.
@@ -253,6 +255,8 @@ struct Result {
     std::optional<double> log10_false_alarms;   ///< How many models chance would support as well.
     std::optional<double> translation_sigma_deg;  ///< Standard deviation of the direction of translation.
     std::optional<double> focal_factor;         ///< The matches ask for focal lengths this many times those given.
+    /// One of the images was flipped: there is no pose, and H mirrors where the pair is planar.
+    bool mirrored = false;
 
     /// The pose of camera 2 relative to camera 1, X2 = T X1 in homogeneous coordinates; nothing without R or t. Two views
     /// do not tell the baseline, the distance of the cameras: it is 1 unless the caller knows better.
