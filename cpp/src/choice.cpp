@@ -30,6 +30,7 @@ constexpr int kShareRounds = 8;
 // Gaps between log-likelihoods are compressed beyond this.
 constexpr double kGapUnit = 3.0;
 constexpr double kLargestPrior = 0.98;
+// Hypotheses whose log-likelihoods differ by less are equally likely.
 constexpr double kTie = 3.0;
 constexpr double kTiny = 1e-12;
 // Relative support is measured at these distances, pixels, which count this much.
@@ -108,6 +109,31 @@ std::vector<double> checked(const Json& values, const char* name, std::size_t co
                                     " finite numbers, got " + std::to_string(numbers.size()));
     }
     return numbers;
+}
+
+/// What a match that is right with a probability stakes on it.
+std::vector<double> odds_of(const std::vector<double>& probability, const Coefficients& coefficients) {
+    std::vector<double> odds;
+    odds.reserve(probability.size());
+    for (const double p : probability) {
+        odds.push_back(coefficients.outlier_width_px[0] * std::sqrt(2.0 / CV_PI) * p / (1.0 - p));
+    }
+    return odds;
+}
+
+/// Log-likelihood ratio of a hypothesis against all matches being wrong, for a scale of the noise.
+double log_likelihood(const Residuals& residual, const std::vector<double>& odds, double scale,
+                      const Coefficients& coefficients, const std::vector<double>& counts) {
+    double sum = 0.0;
+    for (std::size_t i = 0; i < odds.size(); ++i) {
+        const double squared = residual.distance_px[i] * residual.distance_px[i];
+        const double density = mixture_density(squared, scale, coefficients);
+        if (density > 0.0) {
+            const double sign = residual.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0;
+            sum += counts[i] * std::log1p(odds[i] * sign * density);
+        }
+    }
+    return sum;
 }
 
 }  // namespace
@@ -206,25 +232,12 @@ std::vector<double> independent_counts(const Correspondences& matches, const std
 std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& residuals,
                                                  const std::vector<double>& probability,
                                                  const Coefficients& coefficients, const std::vector<double>& counts) {
-    std::vector<double> odds;
-    odds.reserve(probability.size());
-    for (const double p : probability) {
-        odds.push_back(coefficients.outlier_width_px[0] * std::sqrt(2.0 / CV_PI) * p / (1.0 - p));
-    }
+    const std::vector<double> odds = odds_of(probability, coefficients);
     std::vector<std::vector<double>> likelihoods;
     for (const Residuals& residual : residuals) {
         std::vector<double>& row = likelihoods.emplace_back();
         for (const double scale : coefficients.noise_scales) {
-            double sum = 0.0;
-            for (std::size_t i = 0; i < odds.size(); ++i) {
-                const double squared = residual.distance_px[i] * residual.distance_px[i];
-                const double density = mixture_density(squared, scale, coefficients);
-                if (density > 0.0) {
-                    const double sign = residual.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0;
-                    sum += counts[i] * std::log1p(odds[i] * sign * density);
-                }
-            }
-            row.push_back(sum);
+            row.push_back(log_likelihood(residual, odds, scale, coefficients, counts));
         }
     }
     return likelihoods;
@@ -272,9 +285,7 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         likelihood.push_back(by_scale[h][column]);
         plain.push_back(plain_by_scale[h][column]);
     }
-    const auto whole_by_scale =
-        log_likelihoods(residuals, probability, coefficients, std::vector<double>(count, 1.0));
-    std::vector<double> merit = likelihood, whole_merit;
+    std::vector<double> merit = likelihood;
     std::vector<double> counted = weights;
     for (std::size_t i = 0; i < count; ++i) {
         counted[i] *= counts[i];
@@ -284,15 +295,18 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(count), 1.5);
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
         merit[h] += factor * relative[h];
-        whole_merit.push_back(whole_by_scale[h][column] + factor * whole_relative[h]);
     }
     // Crowded matches count less for one answer against another; between hypotheses of one answer, and near ties, all
     // matches tell the best.
     const std::size_t answer = position_of_largest(merit);
+    const std::vector<double> odds = odds_of(probability, coefficients), once_each(count, 1.0);
+    const double scale = coefficients.noise_scales[column];
+    std::vector<double> whole_merit(number_of_hypotheses, -std::numeric_limits<double>::infinity());
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
         const double angle = pose_angle_deg(hypotheses[h].pose, hypotheses[answer].pose);
-        if (!(angle < kAlternativeDeg || merit[h] > merit[answer] - kTie)) {
-            whole_merit[h] = -std::numeric_limits<double>::infinity();
+        if (angle < kAlternativeDeg || merit[h] > merit[answer] - kTie) {
+            whole_merit[h] =
+                log_likelihood(residuals[h], odds, scale, coefficients, once_each) + factor * whole_relative[h];
         }
     }
     const std::size_t chosen = position_of_largest(whole_merit);
@@ -327,7 +341,6 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
 
     const Pose& pose = hypotheses[chosen].pose;
     const Residuals& residual = residuals[chosen];
-    const double scale = coefficients.noise_scales[column];
     double around = 0.0, weighted_around = 0.0, weighted = 0.0, sum_of_weights = 0.0;
     std::size_t everything_near = 0;
     double near_two = 0.0;

@@ -254,10 +254,10 @@ Result Filter::operator()(const MatchPair& matches) const {
             // A second fit, of an essential matrix, where the matches tell the focal lengths that were guessed.
             for (const detail::FocalEstimate& estimate : detail::estimate_focals(*evidence, model->M)) {
                 detail::PairInput zoomed = pair.with_focals(estimate.factors);
-                const cv::Matx33d E =
-                    detail::usable(essential)
-                        ? detail::project_to_essential(zoom_of(estimate.factors[1]) * essential * zoom_of(estimate.factors[0]))
-                        : essential;
+                cv::Matx33d E = essential;
+                if (detail::usable(E)) {
+                    E = detail::project_to_essential(zoom_of(estimate.factors[1]) * E * zoom_of(estimate.factors[0]));
+                }
                 detail::Evidence scored = detail::gather_scored(zoomed, sent, result.scores, margins, E);
                 detail::Search again(detail::gather_before(zoomed), metadata.choice, options_);
                 auto better = again.with_network(scored);
@@ -314,7 +314,8 @@ Result Filter::operator()(const MatchPair& matches) const {
     if (focal) {
         result.intrinsics = IntrinsicsSource::estimated;
         const cv::Matx33d &K1 = pair.intrinsics1.K, &K2 = pair.intrinsics2.K;
-        result.focal_px = cv::Vec2d(detail::mean_focal_length(K1, K1), detail::mean_focal_length(K2, K2)) / pair.unit_px;
+        const cv::Vec2d focal_px(detail::mean_focal_length(K1, K1), detail::mean_focal_length(K2, K2));
+        result.focal_px = focal_px / pair.unit_px;
         result.focal_sigma = focal->sigmas;
         for (std::string& sentence : focal_sentences(*result.focal_px, focal->sigmas)) {
             result.assumptions.push_back(std::move(sentence));

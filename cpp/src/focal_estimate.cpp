@@ -43,8 +43,8 @@ Correspondences agreeing_with(const Evidence& evidence, const cv::Matx33d& M) {
 
 using FactorGrid = std::array<double, kFactors>;
 
-/// The best pose under a factor, if there is one, and the squared Sampson errors that it leaves, each cut off, summed, in
-/// squared pixels.
+/// The best pose under a factor, if there is one, and the squared Sampson errors that it leaves, each cut off, summed,
+/// in squared pixels.
 struct FocalTrial {
     std::optional<Pose> pose;
     double cost_px = kInfinity;
@@ -71,7 +71,8 @@ FocalTrial pose_under(const Correspondences& rows, const cv::Matx33d& F, double 
 /// The factor that both images share, and the position of the nearest on the grid.
 ///
 /// @param costs in squared pixels, over the grid. count: number of matches behind them.
-std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorGrid& logs, FactorGrid costs, std::size_t count) {
+std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorGrid& logs, FactorGrid costs,
+                                                                   std::size_t count) {
     double least = kInfinity;
     for (const double cost : costs) {
         least = std::isfinite(cost) ? std::min(least, cost) : least;

@@ -16,10 +16,11 @@ struct FocalEstimate {
     cv::Vec2d sigmas;   // standard deviations of their logarithms: 0.1 is ten per cent
 };
 
-/// The focal lengths under which the matches agree best with a pose, the most plausible first: two different factors where
-/// the matches ask for them, then one that both images share; none where the matches are few.
+/// The focal lengths under which the matches agree best with a pose, the most plausible first: two different factors
+/// where the matches ask for them, then one that both images share; none where the matches are few.
 ///
-/// @param evidence scored matches on the image planes normalised by the guessed focal lengths. F: in the same coordinates.
+/// @param evidence scored matches on the image planes normalised by the guessed focal lengths. F: in the same
+/// coordinates.
 std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::Matx33d& F);
 
 /// True where nearly as many matches agree with an essential matrix as with the F that knows no intrinsics.

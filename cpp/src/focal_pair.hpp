@@ -10,6 +10,7 @@
 #include "epipolar.hpp"
 
 #include <optional>
+#include <vector>
 
 namespace mgca::detail {
 
@@ -29,8 +30,8 @@ struct TwoFocals {
 /// Least squares on a pose and two focal lengths.
 class FocalPairFit {
 public:
-    /// @param rows matches on the image planes normalised by the guessed focal lengths. threshold: Sampson distance where
-    /// the error is cut off, in that unit. noise: standard deviation of the distances, likewise.
+    /// @param rows matches on the image planes normalised by the guessed focal lengths. threshold: Sampson distance
+    /// where the error is cut off, in that unit. noise: standard deviation of the distances, likewise.
     FocalPairFit(Correspondences rows, double threshold, double noise, const FocalBelief& belief);
 
     /// The best with two focal lengths, or nothing where one does about as well.

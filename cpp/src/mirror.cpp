@@ -14,8 +14,8 @@ namespace {
 constexpr double kLeastShare = 0.25;
 constexpr double kMirrorPx = 2.0;
 constexpr int kTriangles = 300;
-// Share of triangles that turn: of a mirrored plane with wrong matches about it; of a mirrored scene with depth, of whose
-// pose nothing else tells.
+// Share of triangles that turn: of a mirrored plane with wrong matches about it; of a mirrored scene with depth, of
+// whose pose nothing else tells.
 constexpr double kTurnedPlane = 0.5, kTurnedScene = 0.7;
 
 int count_near(const std::vector<double>& distances, double threshold) {

@@ -13,8 +13,8 @@ namespace mgca::detail {
 /// The verdict with the mirroring homography in the place of a pose, where that is what the matches tell; of a mirrored
 /// scene with depth low support and no pose; else the verdict itself.
 ///
-/// @param evidence what the model was fitted to. verdict: on that model. mask_threshold_px: Sampson distance below which a
-/// match is kept, pixels.
+/// @param evidence what the model was fitted to. verdict: on that model. mask_threshold_px: Sampson distance below which
+/// a match is kept, pixels.
 Verdict judge_mirror(const PairInput& pair, const Evidence& evidence, Verdict verdict, double mask_threshold_px,
                      const Options& options);
 

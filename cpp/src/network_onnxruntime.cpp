@@ -15,6 +15,14 @@ namespace mgca::detail {
 namespace {
 
 constexpr const char* kCpu = "CPUExecutionProvider";
+// Squaring a matrix twenty times, the heart of the eight-point algorithm, is beyond half precision and TF32: providers
+// that would use them by default are told not to. What the caller sets stays.
+struct FullPrecision {
+    const char *provider, *option, *value;
+};
+constexpr std::array<FullPrecision, 3> kFullPrecision{{{"OpenVINOExecutionProvider", "precision", "FP32"},
+                                                       {"CUDAExecutionProvider", "use_tf32", "0"},
+                                                       {"TensorrtExecutionProvider", "trt_fp16_enable", "0"}}};
 constexpr std::array<const char*, 2> kInputNames{"correspondences", "attributes"};
 constexpr std::array<const char*, 2> kOutputNames{"logits", "essential"};
 
@@ -27,6 +35,14 @@ Ort::Env make_environment() {
     Ort::Env environment(ORT_LOGGING_LEVEL_ERROR, "mgca");
     environment.DisableTelemetryEvents();
     return environment;
+}
+
+/// Options with those that keep the providers in float32 beside the caller's.
+RuntimeOptions in_full_precision(RuntimeOptions options) {
+    for (const FullPrecision& wish : kFullPrecision) {
+        options.provider_options[wish.provider].emplace(wish.option, wish.value);
+    }
+    return options;
 }
 
 void append_provider(Ort::SessionOptions& session, const std::string& name, const RuntimeOptions& options) {
@@ -95,7 +111,7 @@ public:
         }
         if (!usable.empty() && usable != std::vector<std::string>{kCpu}) {
             try {
-                session_ = open(content, usable, options);
+                session_ = open_in_full_precision(content, usable, options);
             } catch (const Ort::Exception& error) {
                 reason = usable[0] + " failed (" + error.what() + ")";
                 refuse(options, reason);
@@ -143,6 +159,16 @@ private:
     static void refuse(const RuntimeOptions& options, const std::string& reason) {
         if (!options.cpu_fallback) {
             throw RuntimeError("providers: " + reason);
+        }
+    }
+
+    /// As the caller has it where a provider does not know that option yet.
+    Ort::Session open_in_full_precision(std::string_view content, const std::vector<std::string>& providers,
+                                        const RuntimeOptions& options) {
+        try {
+            return open(content, providers, in_full_precision(options));
+        } catch (const Ort::Exception&) {
+            return open(content, providers, options);
         }
     }
 

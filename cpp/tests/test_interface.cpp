@@ -243,6 +243,14 @@ void cameras_are_felt(const Model& model, const MatchPair& pair) {
     check::that(doubtful.assumptions.size() == 2 && doubtful.assumptions[0].find("dist1 shows nothing at") == 0 &&
                     doubtful.assumptions[0].find("Fisheye(k1, k2, k3, k4)") != std::string::npos,
                 "a lens that shows nothing is doubted");
+    Camera wide(cv::Matx33d(150, 0, 320, 0, 150, 240, 0, 0, 1), {-0.02, 0.004, -0.001, 0.0002});
+    const Result sideways = filter(pair.keypoints1, pair.keypoints2, pair.matches, wide);
+    check::that(sideways.assumptions.size() == 2 &&
+                    sideways.assumptions[0].find("the four coefficients of dist1 are read as a pinhole's") == 0,
+                "four coefficients that see far to the side are doubted");
+    wide.distortion.push_back(0.0);
+    check::that(filter(pair.keypoints1, pair.keypoints2, pair.matches, wide).assumptions.empty(),
+                "five are a pinhole's");
     MatchPair copy = pair;
     copy.resolution = 3.0;
     check::that(straight.num_inliers < filter(copy).num_inliers, "the resolution is felt");
@@ -250,6 +258,38 @@ void cameras_are_felt(const Model& model, const MatchPair& pair) {
     essential.geometry = mgca::Geometry::essential;
     check::throws<ArgumentError>(
         [&] { Filter(model, essential)(pair.keypoints1, pair.keypoints2, pair.matches); }, "needs the intrinsics");
+}
+
+void two_cameras_have_two_focal_lengths(const Model& model, const MatchPair& pair) {
+    const Result result = Filter(model)(pair);
+    check::that(result.ok() && result.intrinsics == mgca::IntrinsicsSource::estimated, "focal lengths are estimated");
+    if (check::that(result.focal_px && result.focal_sigma, "and given")) {
+        check::near((*result.focal_px)[1] / (*result.focal_px)[0], 1.6, 0.1, "of two cameras");
+        check::that((*result.focal_sigma)[0] > 0.0 && (*result.focal_sigma)[1] > 0.0, "with their spread");
+    }
+    check::that(result.assumptions.size() == 4 &&
+                    result.assumptions[3].find("px of image 2 estimated from the matches") != std::string::npos,
+                "in a sentence each");
+    MatchPair known = pair;
+    known.camera1.K = cv::Matx33d(800, 0, 319.5, 0, 800, 239.5, 0, 0, 1);
+    known.camera2.K = cv::Matx33d(1280, 0, 319.5, 0, 1280, 239.5, 0, 0, 1);
+    check::that(!Filter(model)(known).focal_px, "what is given is not estimated");
+    Options options;
+    options.geometry = mgca::Geometry::fundamental;
+    check::that(!Filter(model, options)(pair).focal_px, "nor where F is asked for");
+}
+
+void a_mirrored_image_is_told(const Model& model, const MatchPair& pair) {
+    const Result result = Filter(model)(pair);
+    check::that(result.mirrored && result.status == Status::planar, "a mirrored plane");
+    check::that(!result.E && !result.F && !result.R && !result.t && !result.confidence, "has no pose");
+    check::that(result.H && cv::determinant(*result.H) < 0.0, "and a map that mirrors");
+    check::that(result.assumptions.back().find("one of the images is mirrored") == 0, "which a sentence says");
+    Options options;
+    options.keep_precision = 0.99999;
+    const Result empty = Filter(model, options)(pair);
+    check::that(empty.num_inliers == 0 && empty.assumptions.back().find("keep_precision=0.99999 keeps no match") == 0,
+                "an empty mask says why");
 }
 
 void threads_share_a_filter(const Model& model, const MatchPair& pair) {
@@ -364,6 +404,8 @@ int main(int argc, char** argv) {
     memory_and_file_agree(file, model, pair);
     embedded_model_is_the_file(model, pair);
     c_agrees(file, model, pair);
+    two_cameras_have_two_focal_lengths(model, golden::read_input(golden, "two_focal_lengths"));
+    a_mirrored_image_is_told(model, golden::read_input(golden, "mirrored_plane"));
     words_are_read();
     return check::result("interface");
 }

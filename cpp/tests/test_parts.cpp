@@ -8,8 +8,11 @@
 #include "estimators.hpp"
 #include "evidence.hpp"
 #include "focal_check.hpp"
+#include "focal_pair.hpp"
 #include "homography.hpp"
+#include "homography_fit.hpp"
 #include "json.hpp"
+#include "mirror.hpp"
 #include "pose_refinement.hpp"
 #include "robust_fit.hpp"
 #include "sha256.hpp"
@@ -215,6 +218,88 @@ void a_wrong_focal_length_is_noticed() {
     check::near(factor.value_or(0.0), 1.5, 0.3, "and the factor is about one and a half");
 }
 
+/// Matches as they look under a guess of which the true focal lengths are these factors.
+Correspondences seen_under(const Correspondences& matches, double factor1, double factor2) {
+    Correspondences seen;
+    for (const Correspondence& match : matches) {
+        seen.emplace_back(match[0] * factor1, match[1] * factor1, match[2] * factor2, match[3] * factor2);
+    }
+    return seen;
+}
+
+void two_focal_lengths_are_found_where_they_differ() {
+    const Pose skew{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.6, 0.5))};
+    const FocalBelief belief{-0.3, 0.35};
+    const auto found = [&](const Correspondences& rows, const Pose& pose, double start, double noise_px) {
+        return FocalPairFit(rows, 2.0 / kFocal, noise_px / kFocal, belief).differing(pose, start);
+    };
+    for (const double zoom : {0.5, 0.75, 1.3, 2.0}) {
+        const double start = std::log(0.8 * std::sqrt(zoom));
+        const Correspondences rows = seen_under(draw_matches(skew, 300, 0.02, 21), 0.8, 0.8 * zoom);
+        Correspondences swapped;
+        for (const Correspondence& row : rows) {
+            swapped.emplace_back(row[2], row[3], row[0], row[1]);
+        }
+        const auto both = found(rows, skew, start, 0.1);
+        const auto other = found(swapped, {skew.R.t(), -(skew.R.t() * skew.t)}, start, 0.1);
+        if (check::that(both && other, "two focal lengths, whichever image comes first")) {
+            check::near(both->logs[0], std::log(0.8), 0.05, "that of image 1");
+            check::near(both->logs[1], std::log(0.8 * zoom), 0.05, "that of image 2");
+            check::near(both->logs[1] - both->logs[0], std::log(zoom), 0.02, "their ratio");
+            check::that(both->ratio_sigma < both->sigmas[0] + both->sigmas[1], "which is known better");
+            check::near(other->logs[0], both->logs[1], 0.02, "swapped images swap them");
+            check::near(other->sigmas[0], both->sigmas[1], 0.2 * both->sigmas[1], "with their spread");
+        }
+    }
+    for (unsigned seed = 0; seed < 3; ++seed) {
+        check::that(!found(seen_under(draw_matches(skew, 300, 0.3, seed), 0.8, 0.8), skew, std::log(0.8), 0.3),
+                    "one camera has one focal length");
+    }
+    const Correspondences turned = draw_matches({skew.R, {0.0, 0.0, 0.0}}, 200, 0.3, 22);
+    check::that(!found(turned, {skew.R, {1.0, 0.0, 0.0}}, 0.0, 0.3), "a rotation tells no zoom");
+    check::that(!found({}, skew, 0.0, 0.3), "nothing tells nothing");
+}
+
+void mirrors_are_told_and_mapped_where_that_is_allowed() {
+    Correspondences matches, mirrored;
+    for (const Correspondence& match : draw_matches({kPose.R, {0.0, 0.0, 0.0}}, 100, 0.0, 23)) {
+        const Correspondence pixels = kFocal * match;
+        matches.push_back(pixels);
+        mirrored.emplace_back(pixels[0], pixels[1], -pixels[2], pixels[3]);
+    }
+    check::near(share_of_turned_triangles(matches), 0.0, 0.0, "no triangle turns");
+    check::near(share_of_turned_triangles(mirrored), 1.0, 0.0, "in a mirror all do");
+    check::near(share_of_turned_triangles({{1, 2, 3, 4}}), 0.0, 0.0, "one match is no triangle");
+    HomographyOptions options;
+    const auto within = [&](const std::optional<cv::Matx33d>& H) {
+        const std::vector<double> distances = H ? sampson_distances_to_homography(mirrored, *H) : std::vector<double>{};
+        return std::count_if(distances.begin(), distances.end(), [](double distance) { return distance < 0.1; });
+    };
+    check::that(within(estimate_homography(mirrored, options, {})) < 20, "a plane does not mirror");
+    options.reflection = true;
+    const auto H = estimate_homography(mirrored, options, {});
+    check::equal(within(H), std::ptrdiff_t{100}, "where it may, all agree");
+    check::that(H && cv::determinant(*H) < 0.0, "with a map that mirrors");
+    check::equal(within(estimate_homography(matches, options, {})), std::ptrdiff_t{0}, "and nothing is made to mirror");
+}
+
+void a_loose_direction_has_a_wide_spread() {
+    const auto spread = [](double baseline, double noise_px) {
+        const Pose pose{kPose.R, baseline * kPose.t};
+        return direction_uncertainty_deg(draw_matches(pose, 300, 0.0, 24), kPose, noise_px / kFocal);
+    };
+    check::that(spread(1.0, 0.05) < 0.1, "a long baseline holds the direction");
+    check::near(spread(1.0, 0.05) / spread(1.0, 0.025), 2.0, 1e-6, "in proportion to the noise");
+    double before = 0.0;
+    for (const double baseline : {1.0, 0.3, 0.1, 0.03, 0.01, 0.001}) {
+        const double now = spread(baseline, 0.5);
+        check::that(before < now && now < 90.0, "the shorter the baseline, the wider");
+        before = now;
+    }
+    check::that(before > 30.0, "next to no baseline says next to nothing");
+    check::near(direction_uncertainty_deg({}, kPose, 1e-3), 90.0, 0.0, "nothing says nothing");
+}
+
 Coefficients coefficients() {
     return Coefficients::read(Json::parse(R"({
         "score_trust": [0.8, 0.5, 0.05], "noise_px": [0.25, 0.6, 1.5], "noise_weights": [0.4, 0.4, 0.2],
@@ -309,6 +394,9 @@ int main() {
     a_line_a_rotation_and_a_plane_are_recognised();
     chance_is_told_from_support();
     a_wrong_focal_length_is_noticed();
+    two_focal_lengths_are_found_where_they_differ();
+    mirrors_are_told_and_mapped_where_that_is_allowed();
+    a_loose_direction_has_a_wide_spread();
     the_likelier_hypothesis_is_chosen();
     residuals_become_scores();
     probabilities_and_logits_are_inverse();

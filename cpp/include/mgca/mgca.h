@@ -165,9 +165,10 @@ MGCA_C_API const double *mgca_result_matrix(const mgca_result *result, const cha
 /* Three numbers of unit length; NULL where there is none. */
 MGCA_C_API const double *mgca_result_translation(const mgca_result *result);
 
-/* "num_inliers", "num_accepted", "confidence", "num_network_matches", "support", "log10_false_alarms", "translation_sigma_deg",
- * "focal_px1", "focal_px2" (estimated focal lengths of both images), "focal_sigma1", "focal_sigma2" (their relative standard
- * deviations) or "focal_factor", NaN where there is none; "mirrored", 1 where one of the images was flipped, else 0. */
+/* "num_inliers", "num_accepted", "confidence", "num_network_matches", "support", "log10_false_alarms",
+ * "translation_sigma_deg", "focal_px1", "focal_px2" (estimated focal lengths of both images), "focal_sigma1",
+ * "focal_sigma2" (their relative standard deviations) or "focal_factor", NaN where there is none; "mirrored", 1 where one
+ * of the images was flipped, else 0. */
 MGCA_C_API double mgca_result_number(const mgca_result *result, const char *name);
 
 /* "intrinsics" ("given", "estimated" or "guessed"), "origin" or "ended"; NULL for another name. */
