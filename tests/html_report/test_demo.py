@@ -1,0 +1,187 @@
+"""The demo of the documentation in a browser: Python's logits, photographs of one's own, and a page that asks nobody."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import http.server
+import importlib
+import json
+import queue
+import re
+import shutil
+import subprocess
+import threading
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from browser import CHROMIUM, needs_chromium
+
+from mgca_filter import model_path
+from mgca_filter.geometry.cameras import normalize_points
+from mgca_filter.geometry.epipolar import sampson_distance
+from mgca_filter.inference import open_backend
+from mgca_filter.inference.scoring import assemble_logits, run_network, select_network_input
+
+pytest.importorskip("skimage")
+pytestmark = [needs_chromium, pytest.mark.slow, pytest.mark.timeout(600)]
+LARGEST_DIFFERENCE = 2e-3
+"""Of two runtimes' logits, which are of the order of ten."""
+QUESTIONS = Path(__file__).with_name("demo_questions.js")
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory) -> Path:
+    """The demo as the documentation has it."""
+    folder = tmp_path_factory.mktemp("site") / "demo"
+    reason = browser_demo().build(folder)
+    if reason:
+        pytest.skip(f"no ONNX Runtime and OpenCV for the browser: {reason}")
+    return folder
+
+
+def browser_demo() -> Any:
+    """The extension of Sphinx that writes the demo."""
+    place = str(Path(__file__).parents[2] / "docs" / "extensions")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(place)
+        return importlib.import_module("browser_demo")
+
+
+class Visit(http.server.SimpleHTTPRequestHandler):
+    """Serves the demo, and takes what the questions' answers are."""
+
+    outcomes: queue.Queue[Any] = queue.Queue()
+    asked: list[str] = []
+
+    def do_GET(self) -> None:
+        self.asked.append(self.path)
+        super().do_GET()
+
+    def do_POST(self) -> None:
+        self.outcomes.put(json.loads(self.rfile.read(int(self.headers["Content-Length"]))))
+        self.send_response(204)
+        self.end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        """Nothing is printed."""
+
+
+@pytest.fixture(scope="module")
+def seen(demo, tmp_path_factory) -> dict[str, Any]:
+    """Answers to all questions, by name, in one visit."""
+    page = (demo / "index.html").read_text(encoding="utf-8")
+    questions = f"<script>{QUESTIONS.read_text(encoding='utf-8')}</script></body>"
+    (demo / "asked.html").write_text(page.replace("</body>", questions), encoding="utf-8")
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Visit, directory=str(demo)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    flags = ("--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking")
+    profile = f"--user-data-dir={tmp_path_factory.mktemp('profile')}"
+    # A debugging port keeps the browser open until it is told to go.
+    address = f"http://127.0.0.1:{server.server_port}/asked.html"
+    visit = subprocess.Popen(
+        [str(CHROMIUM), *flags, profile, "--remote-debugging-port=0", address],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        return Visit.outcomes.get(timeout=300)
+    finally:
+        visit.terminate()
+        visit.wait(30)
+        server.shutdown()
+        server.server_close()
+
+
+def floats(text: str, width: int) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, width)
+
+
+def python_logits(pair: dict[str, Any], name: str) -> np.ndarray:
+    """Logits (M,) of all matches of a pair, as ``filter_matches`` gets them."""
+    points, attributes = floats(pair["points"], 4), floats(pair["attributes"], 8)
+    backend = open_backend(model_path(name))
+    x = np.hstack([normalize_points(points[:, :2], pair["K1"]), normalize_points(points[:, 2:], pair["K2"])])
+    valid = np.ones(len(x), dtype=bool)
+    sent = select_network_input(x, attributes, valid, backend, seed=0)
+    return assemble_logits(attributes, valid, sent, run_network(backend, [sent])[0], backend)
+
+
+@pytest.mark.parametrize("name", ["default", "fast"])
+@pytest.mark.parametrize("number", range(5))
+def test_logits_are_those_of_python(seen, demo, name, number):
+    pair = json.loads((demo / f"pair{number}.json").read_text(encoding="utf-8"))
+    expected = python_logits(pair, name)
+    answer = seen["scores"][model_path(name).stem][number]
+    difference = np.abs(np.array(answer["logits"]) - expected)
+    print(f"{name}, pair {number}: largest difference of a logit {difference.max():.1e}")
+    assert len(answer["logits"]) > 500
+    assert difference.max() < LARGEST_DIFFERENCE
+    backend = open_backend(model_path(name))
+    scores = backend.metadata.calibration.probabilities(expected)
+    np.testing.assert_allclose(answer["scores"], scores, atol=LARGEST_DIFFERENCE)
+    clear = np.abs(expected - backend.metadata.decision_threshold) > LARGEST_DIFFERENCE
+    accepted = expected > backend.metadata.decision_threshold
+    np.testing.assert_array_equal(np.array(answer["accepted"])[clear], accepted[clear])
+
+
+def test_matches_of_rendered_pairs_are_right_where_the_score_says_so(seen):
+    for answers in seen["scores"].values():
+        for answer in answers[:4]:
+            sure = np.array(answer["scores"]) > 0.9
+            assert np.mean(np.array(answer["right"])[sure]) > 0.9
+
+
+def test_the_viewer_shows_what_is_accepted(seen):
+    shown = seen["viewer"]
+    assert shown["colours"] > 1000
+    assert shown["kept"] == sum(seen["scores"]["mgca_small"][1]["accepted"])
+    assert 0 < shown["fewer"] < shown["kept"]
+    assert shown["complaints"] == []
+
+
+def test_photographs_of_ones_own_are_matched_and_scored(seen, demo):
+    own = seen["own"]
+    pair = json.loads((demo / "pair1.json").read_text(encoding="utf-8"))
+    points = np.array(own["points"]).reshape(-1, 4)
+    accepted = np.array(own["accepted"])
+    right = sampson_distance(points, np.array(pair["true_F"])) < 3
+    assert accepted.sum() > 100
+    assert np.mean(right[accepted]) > 0.9
+    assert "AKAZE" in own["said"]
+    assert any("Loading OpenCV" in words for words in own["steps"])
+
+
+def test_matches_of_photographs_are_those_of_opencv_in_python(seen, demo):
+    pair = json.loads((demo / "pair1.json").read_text(encoding="utf-8"))
+    images = [cv2.imdecode(np.frombuffer(base64.b64decode(a.split(",")[1]), np.uint8), 0) for a in pair["images"]]
+    akaze = getattr(cv2, "AKAZE", None) or cv2.xfeatures2d.AKAZE
+    count = len(akaze.create().detect(images[0]))
+    assert len(seen["own"]["accepted"]) == pytest.approx(count, rel=0.05)
+
+
+def test_a_file_that_is_no_image_is_told(seen):
+    assert "notes.txt" in seen["noImage"]["said"]
+    assert seen["noImage"]["failed"]
+
+
+def test_nothing_comes_from_elsewhere(seen, demo):
+    assert "/opencv.js" in Visit.asked
+    for path in [*demo.glob("*.html"), demo / "demo.js", demo / "worker.js", demo / "demo.css", demo / "style.css"]:
+        loaded = re.findall(
+            r"(?:src=|href=|url\(|fetch\(|importScripts\()[\"']?https?:", path.read_text(encoding="utf-8")
+        )
+        assert loaded == [], path.name
+
+
+def test_without_npm_the_page_says_that_it_cannot_score(tmp_path, monkeypatch):
+    extension = browser_demo()
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    assert extension.build(tmp_path) == "npm is not installed"
+    settings = json.loads((tmp_path / "settings.json").read_text(encoding="utf-8"))
+    assert settings["complete"] is False
+    assert len(settings["pairs"]) == 5
+    assert not (tmp_path / "opencv.js").exists()
