@@ -1,7 +1,7 @@
 // Put behind the demo's page by test_demo.py: uses it as a reader would, and posts what it saw.
 
 const wait = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
-const plain = ({ logits, scores, accepted, points }) => ({ logits: [...logits], scores: [...scores], accepted, points: [...points] });
+const lists = (answer) => Object.fromEntries(Object.entries(answer).map(([name, value]) => [name, ArrayBuffer.isView(value) ? [...value] : value]));
 const answerWindow = () => byId("answer").contentWindow;
 
 async function until(holds) {
@@ -28,7 +28,7 @@ const QUESTIONS = {
         const bits = Uint8Array.from(atob(pair.right), (c) => c.charCodeAt(0));
         const answer = await run(pair, model);
         const right = answer.accepted.map((_, i) => (bits[i >> 3] >> (i & 7)) & 1);
-        seen[model].push({ ...plain(answer), points: [], right });
+        seen[model].push({ ...lists(answer), right });
       }
     }
     return seen;
@@ -50,7 +50,7 @@ const QUESTIONS = {
     const pixels = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
     const seen = { colours: new Set(new Uint32Array(pixels.buffer)).size, kept: kept() };
     const slider = page.getElementById("slider-score");
-    slider.value = 0.9;
+    slider.value = 0.5;
     slider.dispatchEvent(new Event("input"));
     return { ...seen, fewer: kept(), complaints };
   },
@@ -68,7 +68,7 @@ const QUESTIONS = {
     await until(() => /AKAZE/.test(byId("progress").textContent));
     watch.disconnect();
     ask = before;
-    return { ...plain(answer), logits: [], steps, said: byId("progress").textContent };
+    return { ...lists(answer), steps, said: byId("progress").textContent };
   },
 
   async noImage() {

@@ -1,4 +1,4 @@
-"""The demo of the documentation in a browser: Python's logits, photographs of one's own, and a page that asks nobody."""
+"""The demo of the documentation in a browser: Python's logits, photographs of one's own, nothing from elsewhere."""
 
 from __future__ import annotations
 
@@ -21,15 +21,17 @@ import pytest
 from browser import CHROMIUM, needs_chromium
 
 from mgca_filter import model_path
+from mgca_filter.features import create_detector, describe, match_features
 from mgca_filter.geometry.cameras import normalize_points
-from mgca_filter.geometry.epipolar import sampson_distance
-from mgca_filter.inference import open_backend
+from mgca_filter.geometry.epipolar import fundamental_from_essential, sampson_distance
+from mgca_filter.inference import Backend, open_backend
 from mgca_filter.inference.scoring import assemble_logits, run_network, select_network_input
 
 pytest.importorskip("skimage")
 pytestmark = [needs_chromium, pytest.mark.slow, pytest.mark.timeout(600)]
-LARGEST_DIFFERENCE = 2e-3
-"""Of two runtimes' logits, which are of the order of ten."""
+# Neighbours are chosen by comparison, so that runtimes differ where two are equally far (mgca_filter.export.parity),
+# the larger network more. Nine of ten logits, which reach ten, agree better than the first number, all than the second.
+AGREEMENT = {"default": (0.05, 1.0), "fast": (2e-4, 0.02)}
 QUESTIONS = Path(__file__).with_name("demo_questions.js")
 
 
@@ -88,51 +90,60 @@ def seen(demo, tmp_path_factory) -> dict[str, Any]:
         stderr=subprocess.DEVNULL,
     )
     try:
-        return Visit.outcomes.get(timeout=300)
+        outcome = Visit.outcomes.get(timeout=300)
     finally:
         visit.terminate()
         visit.wait(30)
         server.shutdown()
         server.server_close()
+    assert {name: answer["error"] for name, answer in outcome.items() if "error" in answer} == {}
+    return outcome
 
 
 def floats(text: str, width: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, width)
 
 
-def python_logits(pair: dict[str, Any], name: str) -> np.ndarray:
-    """Logits (M,) of all matches of a pair, as ``filter_matches`` gets them."""
+def python_answer(pair: dict[str, Any], backend: Backend) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Logits (M,) of a pair as ``filter_matches`` gets them, rows (N,) that are the network's, and its E (3, 3)."""
     points, attributes = floats(pair["points"], 4), floats(pair["attributes"], 8)
-    backend = open_backend(model_path(name))
     x = np.hstack([normalize_points(points[:, :2], pair["K1"]), normalize_points(points[:, 2:], pair["K2"])])
     valid = np.ones(len(x), dtype=bool)
     sent = select_network_input(x, attributes, valid, backend, seed=0)
-    return assemble_logits(attributes, valid, sent, run_network(backend, [sent])[0], backend)
+    (output,) = run_network(backend, [sent])
+    return assemble_logits(attributes, valid, sent, output, backend), sent.rows, output.essential
 
 
-@pytest.mark.parametrize("name", ["default", "fast"])
+@pytest.mark.parametrize("name", AGREEMENT)
 @pytest.mark.parametrize("number", range(5))
 def test_logits_are_those_of_python(seen, demo, name, number):
-    pair = json.loads((demo / f"pair{number}.json").read_text(encoding="utf-8"))
-    expected = python_logits(pair, name)
-    answer = seen["scores"][model_path(name).stem][number]
-    difference = np.abs(np.array(answer["logits"]) - expected)
-    print(f"{name}, pair {number}: largest difference of a logit {difference.max():.1e}")
-    assert len(answer["logits"]) > 500
-    assert difference.max() < LARGEST_DIFFERENCE
     backend = open_backend(model_path(name))
-    scores = backend.metadata.calibration.probabilities(expected)
-    np.testing.assert_allclose(answer["scores"], scores, atol=LARGEST_DIFFERENCE)
-    clear = np.abs(expected - backend.metadata.decision_threshold) > LARGEST_DIFFERENCE
-    accepted = expected > backend.metadata.decision_threshold
-    np.testing.assert_array_equal(np.array(answer["accepted"])[clear], accepted[clear])
+    pair = json.loads((demo / f"pair{number}.json").read_text(encoding="utf-8"))
+    expected, rows, essential = python_answer(pair, backend)
+    answer = seen["scores"][model_path(name).stem][number]
+    logits = np.array(answer["logits"])
+    difference = np.abs(logits - expected)
+    most = np.quantile(difference[rows], 0.9)
+    print(f"{name}, pair {number}: nine of ten logits within {most:.0e}, all within {difference.max():.0e}")
+    assert 300 < len(rows) < len(expected) == len(logits)
+    assert most < AGREEMENT[name][0]
+    assert difference.max() < AGREEMENT[name][1]
+    # What never met the network differs by the rounding of one number.
+    np.testing.assert_allclose(np.delete(logits, rows), np.delete(expected, rows), atol=1e-5)
+    threshold = backend.metadata.decision_threshold
+    np.testing.assert_array_equal(answer["accepted"], logits > threshold)
+    assert np.count_nonzero((logits > threshold) != (expected > threshold)) <= len(rows) // 100
+    np.testing.assert_allclose(answer["scores"], backend.metadata.calibration.probabilities(logits), atol=1e-6)
+    F = fundamental_from_essential(essential, pair["K1"], pair["K2"])
+    F, F_there = (np.ravel(matrix) / np.linalg.norm(matrix) for matrix in (F, answer["F"]))
+    assert abs(F @ F_there) == pytest.approx(1, abs=1e-4)
 
 
-def test_matches_of_rendered_pairs_are_right_where_the_score_says_so(seen):
+def test_the_best_matches_of_rendered_pairs_are_right(seen):
     for answers in seen["scores"].values():
         for answer in answers[:4]:
-            sure = np.array(answer["scores"]) > 0.9
-            assert np.mean(np.array(answer["right"])[sure]) > 0.9
+            best = np.argsort(answer["scores"])[-50:]
+            assert np.mean(np.array(answer["right"])[best]) > 0.8
 
 
 def test_the_viewer_shows_what_is_accepted(seen):
@@ -155,12 +166,21 @@ def test_photographs_of_ones_own_are_matched_and_scored(seen, demo):
     assert any("Loading OpenCV" in words for words in own["steps"])
 
 
-def test_matches_of_photographs_are_those_of_opencv_in_python(seen, demo):
+def test_matches_of_photographs_are_described_as_in_python(seen, demo):
     pair = json.loads((demo / "pair1.json").read_text(encoding="utf-8"))
-    images = [cv2.imdecode(np.frombuffer(base64.b64decode(a.split(",")[1]), np.uint8), 0) for a in pair["images"]]
-    akaze = getattr(cv2, "AKAZE", None) or cv2.xfeatures2d.AKAZE
-    count = len(akaze.create().detect(images[0]))
-    assert len(seen["own"]["accepted"]) == pytest.approx(count, rel=0.05)
+    codes = (np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8) for address in pair["images"])
+    found = [describe(cv2.imdecode(code, cv2.IMREAD_COLOR), create_detector("akaze")) for code in codes]
+    matches = match_features(*found)
+    expected = np.hstack([found[0].points[matches.index1], found[1].points[matches.index2]])  # (M, 4)
+    there = np.array(seen["own"]["points"]).reshape(-1, 4)
+    # Another decoder and another rounding of grey: most keypoints are the same to a tenth of a pixel.
+    distance = np.abs(expected[:, None] - there[None]).max(axis=2)
+    same = distance.min(axis=1) < 0.1
+    assert same.sum() > 0.6 * len(expected)
+    attributes = np.array(seen["own"]["attributes"]).reshape(-1, 8)[distance.argmin(axis=1)]
+    difference = np.abs(attributes - matches.attributes.encode(len(expected)))[same]
+    assert np.quantile(difference, 0.8, axis=0).max() < 0.05
+    assert difference[:, 5:].max() == 0
 
 
 def test_a_file_that_is_no_image_is_told(seen):
