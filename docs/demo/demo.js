@@ -43,7 +43,8 @@ async function ownPair(files) {
   const photographs = await Promise.all(files.map(pixelsOf));
   const sizes = photographs.map(({ width, height }) => [width, height]);
   const [K1, K2] = sizes.map(guessedIntrinsics);
-  return { photographs, sizes, K1, K2, names: files.map((file) => file.name), images: photographs.map(addressOf) };
+  const remark = "Keypoints: AKAZE; the focal length is guessed, 1.2 times the longer side.";
+  return { photographs, sizes, K1, K2, remark, names: files.map((file) => file.name), images: photographs.map(addressOf) };
 }
 
 async function pixelsOf(file) {
@@ -117,14 +118,15 @@ async function run(pair, model) {
   const answer = await ask({ photographs, matches, K1, K2, model });
   await show(viewerData(pair, answer));
   const [kept, all] = [answer.accepted.filter(Boolean).length, answer.scores.length];
-  say(`${kept} of ${all} matches accepted by ${model} in ${(answer.milliseconds / 1000).toFixed(1)} s.` +
-    (photographs ? " Keypoints: AKAZE; focal length guessed, 1.2 times the longer side." : " Keypoints: RootSIFT, found by Python when this page was built."));
+  say(`${kept} of ${all} matches accepted by ${model} in ${(answer.milliseconds / 1000).toFixed(1)} s. ${pair.remark}`);
   return answer;
 }
 
 async function start() {
   const settings = await json("settings.json");
   byId("missing").hidden = settings.complete;
+  byId("choice").hidden = byId("progress").hidden = !settings.complete;
+  if (!settings.complete) return;
   byId("pair").append(...settings.pairs.map(({ title, file }) => new Option(title, file)), new Option("your own photographs", ""));
   byId("model").append(...Object.keys(settings.models).map((name) => new Option(name, name)));
   const photos = [byId("photo1"), byId("photo2")];
@@ -132,7 +134,6 @@ async function start() {
   async function update() {
     const files = photos.map((input) => input.files[0]);
     const own = byId("pair").value === "";
-    if (!settings.complete) return;
     if (own && !files.every(Boolean)) {
       say("Choose two photographs of one place.");
       return;
@@ -151,7 +152,7 @@ async function start() {
   const next = () => { last = last.then(update); };
   for (const control of [byId("pair"), byId("model")]) control.addEventListener("change", next);
   for (const input of photos) input.addEventListener("change", () => { byId("pair").value = ""; next(); });
-  return last;
+  await last;
 }
 
 const started = start().catch((error) => say(`${error.message}. This page has to come from a web server, not from a file.`, true));

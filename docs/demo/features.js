@@ -2,6 +2,7 @@
 "use strict";
 
 const MAX_KEYPOINTS = 2000;
+const NARROWEST = 6; // pixels; AKAZE fails on narrower strips
 
 // Points and attributes of every match of two photographs (ImageData); a ratio test or cross-check would only take away.
 function matchPhotographs(photograph1, photograph2) {
@@ -16,6 +17,7 @@ function matchPhotographs(photograph1, photograph2) {
 
 // The strongest keypoints of an image, and their descriptors, a Mat of a row each.
 function akaze(photograph) {
+  if (Math.min(photograph.width, photograph.height) < NARROWEST) return { keypoints: [], descriptors: new cv.Mat() };
   const [image, grey, none, found, all] = [cv.matFromImageData(photograph), new cv.Mat(), new cv.Mat(), new cv.KeyPointVector(), new cv.Mat()];
   const detector = new cv.AKAZE();
   try {

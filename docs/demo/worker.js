@@ -81,6 +81,8 @@ self.onmessage = async ({ data: job }) => {
   try {
     self.postMessage({ answer: await answer(job, step) });
   } catch (error) {
-    self.postMessage({ error: String(error.message || error) });
+    // OpenCV throws the address of its exception.
+    const message = typeof error === "number" ? cv.exceptionFromPtr(error).msg : error.message;
+    self.postMessage({ error: String(message || error) });
   }
 };

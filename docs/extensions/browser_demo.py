@@ -40,7 +40,9 @@ from mgca_filter.html_report.page import asset, build_page, plain  # noqa: E402
 from mgca_filter.html_report.pair_report import RIGHT_PX  # noqa: E402
 from mgca_filter.inference.model_file import ModelFile  # noqa: E402
 from mgca_filter.inputs.pair import MatchPair, prepare_pair  # noqa: E402
-from mgca_filter.match_filter import PUBLISHED_MODELS, model_path  # noqa: E402
+from mgca_filter.match_filter import PUBLISHED_MODELS, filter_matches, model_path  # noqa: E402
+from mgca_filter.result import FilterResult  # noqa: E402
+from mgca_filter.verdict_text import describe_verdict  # noqa: E402
 
 if TYPE_CHECKING:
     from sphinx.application import Sphinx
@@ -75,6 +77,7 @@ class Pair:
         (kp1, descriptors1), (kp2, descriptors2) = (detect_keypoints(image, detector) for image in self.images)
         matches = match_descriptors(descriptors1, descriptors2)
         prepared = prepare_pair(MatchPair(kp1, kp2, matches, K1=self.K1, K2=self.K2))
+        result = filter_matches(kp1, kp2, matches, K1=self.K1, K2=self.K2)
         points = np.hstack([prepared.points1, prepared.points2])  # (M, 4)
         F, right = None, np.zeros(len(points), dtype=bool)
         if self.R is not None and self.t is not None:
@@ -90,7 +93,14 @@ class Pair:
             "attributes": encode_floats(prepared.attributes),
             "right": pack_mask(right),
             "true_F": F,
+            "remark": f"With the robust fit the package keeps {result.num_inliers}: {_sentence(result)}",
         }
+
+
+def _sentence(result: FilterResult) -> str:
+    """The verdict of the package, to stand within a sentence."""
+    headline = describe_verdict(str(result.status)).headline
+    return headline[0].lower() + headline[1:]
 
 
 def encode_floats(values: NDArray[Any]) -> str:

@@ -71,6 +71,15 @@ const QUESTIONS = {
     return { ...lists(answer), steps, said: byId("progress").textContent };
   },
 
+  async blank() {
+    const sides = [200, 4];
+    const canvases = sides.map((side) => new OffscreenCanvas(side, side));
+    canvases.forEach((canvas) => canvas.getContext("2d").fillRect(0, 0, 1, 1));
+    choose(await Promise.all(canvases.map(async (canvas) => new File([await canvas.convertToBlob()], "blank.png"))));
+    await until(() => /^0 of /.test(byId("progress").textContent));
+    return { said: byId("progress").textContent };
+  },
+
   async noImage() {
     choose([1, 2].map(() => new File(["no image"], "notes.txt")));
     await until(() => byId("progress").classList.contains("failed"));

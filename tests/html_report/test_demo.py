@@ -183,6 +183,15 @@ def test_matches_of_photographs_are_described_as_in_python(seen, demo):
     assert difference[:, 5:].max() == 0
 
 
+def test_the_package_says_which_pairs_have_a_geometry(demo):
+    remarks = [json.loads((demo / f"pair{number}.json").read_text(encoding="utf-8"))["remark"] for number in range(5)]
+    assert ["both images show one scene" in remark for remark in remarks] == [True, True, True, True, False]
+
+
+def test_images_without_keypoints_have_no_matches(seen):
+    assert seen["blank"]["said"].startswith("0 of 0 matches accepted")
+
+
 def test_a_file_that_is_no_image_is_told(seen):
     assert "notes.txt" in seen["noImage"]["said"]
     assert seen["noImage"]["failed"]
