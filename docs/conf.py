@@ -25,8 +25,8 @@ author = "mgca_filter authors"
 release = version = mgca_filter.__version__
 project_copyright = author
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "generated_reference"]
-exclude_patterns = ["_build", "extensions", "demo", "**/.ipynb_checkpoints"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "generated_reference", "browser_demo"]
+exclude_patterns = ["_build", "extensions", "**/.ipynb_checkpoints"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 templates_path: list[str] = []
 
@@ -56,5 +56,5 @@ html_static_path = ["extensions/static"]
 html_css_files = ["site.css"]
 html_show_sourcelink = False
 html_copy_source = False
-# The report of the example pair is made while the site is built (generated_reference).
+# Made while the site is built: the report of the example pair (generated_reference), and the demo (browser_demo).
 html_extra_path = [tempfile.mkdtemp(prefix="mgca_filter_docs_")]
