@@ -379,7 +379,8 @@ def test_match_images_in_pixels_of_the_originals(
     found = mgca_filter.match_images(*photographs, detector=detector, max_keypoints=800, model=model_file)
     assert isinstance(found.keypoints1[0], cv2.KeyPoint)
     assert len(found.matches) == len(found.keypoints1) == len(found.result.mask)
-    assert found.result.status in (Status.PLANAR, Status.PURE_ROTATION)
+    assert found.result.status in (Status.PLANAR, Status.PURE_ROTATION, Status.LOW_SUPPORT)  # the pose may be doubtful
+    assert found.result.H is not None
     H = np.array([[0.95, 0.03, 20.0], [-0.02, 0.97, 30.0], [2e-5, 1e-5, 1.0]])
     kept = [row[0] for row in found.result.matches]
     source = np.array([[found.keypoints1[m.queryIdx].pt for m in kept]], dtype=np.float64)

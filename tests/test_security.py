@@ -132,10 +132,11 @@ def test_a_file_without_the_pixels_it_promises_takes_no_memory(tmp_path: Path, s
 @pytest.mark.slow
 @pytest.mark.parametrize(("suffix", "size"), [(".webp", 16_383), (".jpg", 16_000)])
 def test_the_largest_images_that_a_small_file_can_hold_are_only_large(tmp_path: Path, suffix: str, size: int) -> None:
-    """A few bytes of WebP are a whole image of one colour, and JPEG fills up what is missing: no crash, no geometry."""
+    """JPEG fills up what is missing, and few bytes of WebP are a whole image where libwebp takes them: no geometry."""
     path = tmp_path / f"flat{suffix}"
     path.write_bytes(promising(suffix, size, size))
     status, error, megabytes = run_measured(path, limit_s=250.0)
-    assert status == 1
+    assert status == 1 or (suffix == ".webp" and status == 2)
+    assert (path.name in error) == (status == 2)
     assert "Traceback" not in error
     assert megabytes < 5000
