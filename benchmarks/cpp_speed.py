@@ -9,7 +9,7 @@ less than they do the clock on the wall; of each pair the fastest call counts.
 from __future__ import annotations
 
 import argparse
-import importlib.util
+import runpy
 import subprocess
 import sys
 import tempfile
@@ -90,14 +90,7 @@ def rendered_pairs(count: int, keypoints: int, supersampling: int = 2) -> list[T
 
 
 def _render_views(count: int, supersampling: int) -> Any:
-    path = ROOT / "examples" / "render_views.py"
-    spec = importlib.util.spec_from_file_location("render_views", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module.render_views(count, supersampling)
+    return runpy.run_path(str(ROOT / "examples" / "render_views.py"))["render_views"](count, supersampling)
 
 
 def write_pairs(path: Path, pairs: Sequence[TimedPair]) -> None:

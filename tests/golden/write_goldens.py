@@ -10,8 +10,8 @@ coefficients, a new rule. ``--expected-only`` leaves the inputs as they are; ``-
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
+import runpy
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -196,14 +196,7 @@ def image_inputs() -> list[GoldenInput]:
     detector = create_detector("sift", 800)
     courtyard = [detect_keypoints(cv2.imread(str(images / name)), detector) for name in ("left.jpg", "right.jpg")]
     camera = np.array(json.loads((images / "pair.json").read_text())["K1"])
-    path = ROOT / "examples" / "render_views.py"
-    spec = importlib.util.spec_from_file_location("render_views", path)
-    assert spec is not None
-    assert spec.loader is not None
-    render_views = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = render_views
-    spec.loader.exec_module(render_views)
-    views = render_views.render_views(3, 1)
+    views = runpy.run_path(str(ROOT / "examples" / "render_views.py"))["render_views"](3, 1)
     found = [detect_keypoints(view.image, create_detector("sift", 500)) for view in views]
     turn = K @ rotation_from_vector(np.array([0.02, 0.15, 0.05])) @ np.linalg.inv(K)
     photograph = cv2.resize(cv2.imread(str(images / "left.jpg")), SIZE, interpolation=cv2.INTER_AREA)
