@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -166,15 +167,22 @@ def _start_ray(count: int, address: str | None) -> Any:
     import joblib
     import ray
     from ray.util.joblib.ray_backend import RayBackend
+    from ray.util.multiprocessing.pool import ResultThread
 
     class StreamingRayBackend(RayBackend):  # type: ignore[misc,unused-ignore]
         """Ray's backend, freed of what it inherits from joblib's for multiprocessing: that it does not stream, and
-        that it stops its actors one by one where Ray itself ends with the run."""
+        that it waits for each actor to finish where Ray itself ends with the run."""
 
         supports_return_generator = True
 
         def terminate(self) -> None:
-            pass
+            """Kill the actors, and wait for the threads that would still ask for results: a thread that asks after
+            the run has ended starts a Ray of its own."""
+            for actor, _ in self._pool._actor_pool:
+                ray.kill(actor)
+            for thread in threading.enumerate():
+                if isinstance(thread, ResultThread):
+                    thread.join()
 
         def abort_everything(self, ensure_ready: bool = True) -> None:
             pass

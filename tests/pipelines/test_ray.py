@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 
 import cv2
 import pytest
@@ -15,8 +16,13 @@ from mgca_filter.pipelines.run import Workers
 from mgca_filter.pipelines.worker import PairWorker
 
 ray = pytest.importorskip("ray")
+from ray.util.multiprocessing.pool import ResultThread  # noqa: E402
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(280)]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(280),
+    pytest.mark.filterwarnings("error::pytest.PytestUnhandledThreadExceptionWarning"),
+]
 
 
 @pytest.fixture
@@ -68,7 +74,13 @@ def test_workers_that_stay_dead_are_a_pipeline_error(paths):
 
     with pytest.raises(PipelineError, match="a Ray worker died more than 3 times"):
         kill_again_and_again()
+    assert_nothing_asks_for_results()
+
+
+def assert_nothing_asks_for_results() -> None:
+    """Ray has ended, and no thread is left that would start it again."""
     assert not ray.is_initialized()
+    assert not [thread for thread in threading.enumerate() if isinstance(thread, ResultThread)]
 
 
 def test_an_error_of_the_source_comes_through(paths):
@@ -78,7 +90,13 @@ def test_an_error_of_the_source_comes_through(paths):
 
     with pytest.raises(PipelineError, match="the source broke"), Workers({}, 2, "ray") as workers:
         list(workers.map("extract", tasks()))
-    assert not ray.is_initialized()
+    assert_nothing_asks_for_results()
+
+
+def test_results_that_nobody_takes_leave_no_thread(paths):
+    with Workers({}, 2, "ray") as workers:
+        next(workers.map("extract", ((f"{k}.png", b"", "sift", 10) for k in range(100))))
+    assert_nothing_asks_for_results()
 
 
 def test_no_cluster_at_the_address_is_one_line(paths, image_folder, tmp_path, capfd):
