@@ -160,8 +160,50 @@ def explains(distance: Array, threshold: float, support: Support) -> bool:
         threshold: inlier threshold, in the unit of ``distance``; twice as much is allowed.
         support: of the general model that the inliers agree with.
     """
+    wanted = _wanted(len(distance), support)
+    return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)
+
+
+def _wanted(count: int, support: Support) -> float:
+    """How many of ``count`` matches a degenerate model must explain."""
     # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
     accidents = support.chance_count + 2.0 * np.sqrt(support.chance_count)
-    count = min(len(distance), support.count)
-    wanted = EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
-    return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)
+    count = min(count, support.count)
+    return EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
+
+
+def may_lie_on_line(points: Array, threshold: float, support: Support) -> bool:
+    """False where no line explains points (N, 2), told by a third of the work of finding the best: see :func:`explains`.
+
+    The least height of a triangle of points within d of one line is at most 2 d, and each point off the line spoils at
+    most one of N / 3 triangles that share none.
+    """
+    third = len(points) // 3
+    a, b, c = points[:third], points[third : 2 * third], points[2 * third : 3 * third]
+    sides = np.stack([b - a, c - b, a - c])  # (3, T, 2)
+    twice_area = np.abs(sides[0, :, 0] * sides[1, :, 1] - sides[0, :, 1] * sides[1, :, 0])
+    longest = np.sqrt(np.einsum("stk,stk->st", sides, sides).max(axis=0))
+    flat = twice_area <= 2.0 * EXPLAINED_THRESHOLD_FACTOR * threshold * longest
+    return bool(third - np.count_nonzero(flat) <= len(points) - _wanted(len(points), support))
+
+
+def may_only_turn(correspondences: Array, threshold: float, support: Support) -> bool:
+    """False where no rotation explains matches (N, 4), told without finding one: see :func:`explains`.
+
+    A rotation keeps the angles between viewing rays, and each match that disagrees spoils at most one of N / 2 pairs of
+    matches that share none.
+
+    Args:
+        threshold: inlier threshold, pixels over the shortest focal length.
+    """
+    half = len(correspondences) // 2
+    sines = []
+    for part in (correspondences[:, :2], correspondences[:, 2:]):
+        rays = _unit(homogeneous(part))
+        cosine = np.einsum("ni,ni->n", rays[:half], rays[half : 2 * half])
+        sines.append(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)))
+    # Half the root of two squared transfer errors is within d: the smaller error, and so the angle between a ray and
+    # what the rotation makes of the other, is within √2 d.
+    tolerance = 2.0 * np.sqrt(2.0) * EXPLAINED_THRESHOLD_FACTOR * threshold
+    alike = np.abs(sines[0] - sines[1]) <= tolerance
+    return bool(half - np.count_nonzero(alike) <= len(correspondences) - _wanted(len(correspondences), support))

@@ -166,7 +166,16 @@ def distinct_rows(rows: Array) -> NDArray[np.intp]:
 
     ``np.unique`` does the same for rows in several times the time.
     """
-    ascending = np.lexsort(rows.T[::-1])  # stable: of equal rows the first stays first
+    ascending = np.argsort(rows[:, 0])
+    column = rows[ascending, 0]
+    equal = np.zeros(len(rows) + 1, dtype=bool)  # to the row before
+    equal[1:-1] = column[1:] == column[:-1]
+    tied = equal[1:] | equal[:-1]
+    if not tied.any():
+        return ascending
+    # The other columns matter among rows whose first is equal, which stand side by side.
+    among = np.sort(ascending[tied])
+    ascending[tied] = among[np.lexsort(rows[among].T[::-1])]  # stable: of equal rows the first stays first
     first = np.ones(len(rows), dtype=bool)
     first[1:] = np.any(rows[ascending[1:]] != rows[ascending[:-1]], axis=1)
     return ascending[first]

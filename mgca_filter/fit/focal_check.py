@@ -31,6 +31,7 @@ _COARSE_ROUNDS = 5
 _MAX_ROWS = 500
 _MAX_STEPS = 8
 _DIFFERENCE = 1e-7
+_SMALL_TURNS = np.stack([rotation_from_vector(_DIFFERENCE * axis) for axis in np.eye(3)])
 
 
 @dataclass(frozen=True)
@@ -75,17 +76,17 @@ def _promised_gain(near: Array, given: _Trial) -> tuple[float, float]:
     Returns:
         The gain beyond that of a step on the pose alone, and 1 or −1: whether the step makes the focal length longer.
     """
-    R, t = given.R, given.t
-    T = cross_matrix(t)
+    R, T = given.R, cross_matrix(given.t)
     # Six small changes: three turns, two moves across t, a longer focal length. Distances have no sign, but neither
-    # has the product of a distance and its derivative.
-    moves = np.linalg.svd(t[None])[2][1:]
-    changed = [T @ rotation_from_vector(_DIFFERENCE * axis) @ R for axis in np.eye(3)]
-    changed += [cross_matrix(t + _DIFFERENCE * move) @ R for move in moves]
-    longer = 1.0 + _DIFFERENCE
-    distance = sampson_distance(near, T @ R)
-    columns = [sampson_distance(near, E) for E in changed] + [sampson_distance(near / longer, T @ R) * longer]
-    jacobian = (np.stack(columns, axis=1) - distance[:, None]) / _DIFFERENCE
+    # has the product of a distance and its derivative. Under a longer focal length the points shrink and with them the
+    # unit of distances: in that of the given one they are those to an E that shrinks its points itself.
+    moves = np.linalg.svd(given.t[None])[2][1:]
+    shrink = np.diag([1.0 / (1.0 + _DIFFERENCE), 1.0 / (1.0 + _DIFFERENCE), 1.0])
+    moved = [cross_matrix(given.t + _DIFFERENCE * move) @ R for move in moves]
+    changed = np.stack([T @ R, *(T @ _SMALL_TURNS @ R), *moved, shrink @ T @ R @ shrink])  # (7, 3, 3)
+    distances = sampson_distance(near, changed)
+    distance = distances[0]
+    jacobian = (distances[1:] - distance).T / _DIFFERENCE
     hessian, gradient = jacobian.T @ jacobian, jacobian.T @ distance
     step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
     pose_step = np.linalg.lstsq(hessian[:5, :5], gradient[:5], rcond=None)[0]

@@ -69,7 +69,7 @@ def judge(
         options: confidence and seed of the robust fits that the tests of degeneracy need.
     """
     nothing = np.zeros(len(pair.valid), dtype=bool)
-    if count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+    if len(evidence) < MIN_MATCHES and count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
         return Verdict(Status.TOO_FEW_MATCHES, nothing)
     if model is None:
         return Verdict(Status.NO_GEOMETRY, nothing)
@@ -85,7 +85,8 @@ def judge(
         return _plane_or(Verdict(Status.NO_GEOMETRY, nothing), pair, evidence, mask_threshold_px, options)
     support = degeneracy.measure_support(fitted, model.M, threshold)
     for part in (inliers[:, :2], inliers[:, 2:]):
-        if degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
+        on_line = degeneracy.may_lie_on_line(part, threshold, support)
+        if on_line and degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
             return Verdict(Status.NO_GEOMETRY, nothing)
     info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
     weak = support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA
@@ -205,6 +206,9 @@ def _test_rotation(
         fitted_rows: (N,) rows of the pair's matches that bear witness.
         near: (N,) bool, those of them that agree with the model.
     """
+    shortest_px = 1.0 / max(np.linalg.norm(np.linalg.inv(K[:2, :2]), 2) for K in (pair.intrinsics1.K, pair.intrinsics2.K))
+    if not degeneracy.may_only_turn(pair.correspondences[fitted_rows], REFINE_PX / shortest_px, support):
+        return None
     R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
     H = pair.intrinsics2.K @ R @ np.linalg.inv(pair.intrinsics1.K)
     distance_px = homography_distance(*pair.pixels(fitted_rows), H)

@@ -6,10 +6,12 @@ translation on its tangent plane (PoseLib and Hartley & Zisserman, 2nd ed., sec.
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import cross_matrix
+from .epipolar import cross_matrix, homogeneous_columns
 
 Array = NDArray[np.float64]
 
@@ -38,24 +40,25 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
     Returns:
         The refined R, t; its truncated cost is never above the one it started from.
     """
-    reached = np.abs(SampsonTerms(correspondences, R, t).residual()) < REACH * threshold
+    now = SampsonTerms(correspondences, R, t)
+    reached = np.abs(now.residual) < REACH * threshold
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
-    correspondences = correspondences[reached]
-    now = SampsonTerms(correspondences, R, t)
-    cost, near = _truncated(now.residual(), threshold)
+    if not reached.all():
+        now = SampsonTerms(correspondences[reached], R, t)
+    cost, near = _truncated(now.residual, threshold)
     damping = _INITIAL_DAMPING
     for _ in range(rounds):
         if np.count_nonzero(near) < MIN_INLIERS:
             break
         residual, J = now.linearise(near)
-        hessian, gradient = J.T @ J, J.T @ residual
+        hessian, gradient = J @ J.T, J @ residual
         previous = cost
         while damping < _MAX_DAMPING:
             damped = hessian + damping * np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
             step = -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
-            new = SampsonTerms(correspondences, *_apply_step(now.R, now.t, step))
-            new_cost, new_near = _truncated(new.residual(), threshold)
+            new = now.moved(step)
+            new_cost, new_near = _truncated(new.residual, threshold)
             if new_cost < cost:
                 now, cost, near = new, new_cost, new_near
                 damping *= 0.1
@@ -68,7 +71,7 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
 
 def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float) -> float:
     """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises."""
-    return _truncated(SampsonTerms(correspondences, R, t).residual(), threshold)[0]
+    return _truncated(SampsonTerms(correspondences, R, t).residual, threshold)[0]
 
 
 def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> float:
@@ -83,9 +86,8 @@ def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> fl
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    terms = SampsonTerms(inliers, R, t)
-    _, J = terms.linearise(np.ones(len(inliers), dtype=bool))
-    curvature = float(np.linalg.eigvalsh(J.T @ J)[0])
+    _, J = SampsonTerms(inliers, R, t).linearise()
+    curvature = float(np.linalg.eigvalsh(J @ J.T)[0])
     return float(np.clip(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 1e-3, 90.0))
 
 
@@ -100,8 +102,8 @@ def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) 
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    _, J = SampsonTerms(inliers, R, t).linearise(np.ones(len(inliers), dtype=bool))
-    information = J.T @ J
+    _, J = SampsonTerms(inliers, R, t).linearise()
+    information = J @ J.T
     rotation, cross, direction = information[:3, :3], information[:3, 3:], information[3:, 3:]
     damping = _SMALLEST_CURVATURE * np.eye(3)
     marginal = direction - cross.T @ np.linalg.solve(rotation + damping, cross)
@@ -121,7 +123,8 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     ring, spoke = np.repeat(np.arange(_RINGS), _SPOKES), np.tile(np.arange(_SPOKES), _RINGS)
     offsets = across[spoke] @ _tangent_basis(t)
     directions = np.cos(angle[ring])[:, None] * t + np.sin(angle[ring])[:, None] * offsets  # (D, 3)
-    costs = step * (_costs_of_directions(rows, R, directions) - _costs_of_directions(rows, R, t[None]))
+    costs = _costs_of_directions(rows, R, np.vstack([t, directions]))
+    costs = step * (costs[1:] - costs[0])
     log_weights = -0.5 * costs / noise**2 + np.log(np.sin(angle[ring]) * width[ring])
     weights = np.exp(log_weights - log_weights.max())
     moved = angle[ring][:, None] * across[spoke]
@@ -131,55 +134,73 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
 
 def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
     """Summed squared Sampson distances (D,) of matches (N, 4) to poses with directions (D, 3), the rotation moved from
-    R as each likes best, to first order."""
-    x1, x2 = (np.column_stack([part, np.ones(len(rows))]) for part in (rows[:, :2], rows[:, 2:]))
-    rays = x1 @ R.T  # (N, 3), in the second camera
-    normals = np.cross(x2[None], directions[:, None])  # (D, N, 3)
-    lines2, lines1 = np.cross(directions[:, None], rays[None]), normals @ R
-    squared_norm = np.sum(lines2[..., :2] ** 2, axis=2) + np.sum(lines1[..., :2] ** 2, axis=2)
-    scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))  # (D, N)
-    residual = np.einsum("nk,dnk->dn", rays, normals) * scale
-    J = np.cross(rays[None], normals) * scale[..., None]  # (D, N, 3)
-    gradient = np.einsum("dnk,dn->dk", J, residual)
-    hessian = np.einsum("dnj,dnk->djk", J, J) + _SMALLEST_CURVATURE * np.eye(3)
+    R as each likes best, to first order.
+
+    Of a direction d the error is d · (r × x2), its derivative by the rotation A d with A = x2 rᵀ - (r · x2) I, and the
+    squared norm of the line normals a quadratic form of d: all are sums of a few products of d with what the matches
+    tell, so that products of matrices give them for all directions and matches at once.
+    """
+    x1, x2 = homogeneous_columns(rows[:, :2]), homogeneous_columns(rows[:, 2:])
+    rays = R @ x1  # (3, N), in the second camera
+    # Line normals in image 2, then in image 1, of unit directions: rows 0 and 1 of d × r and of Rᵀ (x2 × d).
+    units = np.stack([cross_matrix(unit) for unit in np.eye(3)])  # (3, 3, 3)
+    normals = np.concatenate([(units @ rays)[:, :2], R.T[:2] @ -(units @ x2)], axis=1)  # (3, 4, N)
+    forms = np.einsum("jkn,lkn->jln", normals, normals).reshape(9, -1)
+    squares = np.einsum("dj,dl->djl", directions, directions).reshape(-1, 9)  # (D, 9)
+    weight = 1.0 / np.maximum(squares @ forms, np.finfo(np.float64).tiny)  # (D, N)
+    error = directions @ _cross(rays, x2)
+    A = x2[:, None] * rays[None] - np.sum(rays * x2, axis=0) * np.eye(3)[..., None]  # (3, 3, N)
+    pairs = np.einsum("jln,kmn->jklmn", A, A).reshape(81, -1)
+    gradient = np.einsum("djl,dl->dj", ((weight * error) @ A.reshape(9, -1).T).reshape(-1, 3, 3), directions)
+    hessian = np.einsum("djkl,dl->djk", (weight @ pairs.T).reshape(-1, 3, 3, 9), squares)
+    hessian += _SMALLEST_CURVATURE * np.eye(3)
     gain = np.einsum("dk,dk->d", gradient, np.linalg.solve(hessian, gradient[..., None])[..., 0])
-    return np.asarray(np.sum(residual**2, axis=1) - gain, dtype=np.float64)
+    return np.asarray(np.einsum("dn,dn->d", weight * error, error) - gain, dtype=np.float64)
 
 
 class SampsonTerms:
-    """Sampson distances of matches (N, 4) to a pose, and how they change with it; column by column, which is fastest.
+    """Sampson distances of matches (N, 4) to a pose, and how they change with it.
 
     Attributes:
         R, t: the pose.
+        residual: (N,) signed Sampson distances, normalised.
     """
 
     def __init__(self, correspondences: Array, R: Array, t: Array) -> None:
+        self._x1, self._x2 = homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
+        self._measure(R, t)
+
+    def _measure(self, R: Array, t: Array) -> None:
         self.R, self.t = R, t
-        x1, y1, x2, y2 = correspondences.T
-        self._x2, self._y2 = x2, y2
-        r0, r1, r2 = self._rays = [R[i, 0] * x1 + R[i, 1] * y1 + R[i, 2] for i in range(3)]  # in the second camera
-        t0, t1, t2 = t
-        n0, n1, n2 = self._normals = [y2 * t2 - t1, t0 - x2 * t2, x2 * t1 - y2 * t0]  # x2 × t
-        self._error = r0 * n0 + r1 * n1 + r2 * n2  # x2ᵀ E x1
-        l0, l1 = t1 * r2 - t2 * r1, t2 * r0 - t0 * r2  # epipolar lines in image 2, then in image 1
-        m0, m1 = (n0 * R[0, i] + n1 * R[1, i] + n2 * R[2, i] for i in range(2))
-        squared_norm = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        E = cross_matrix(t) @ R
+        line2 = E @ self._x1  # (3, N)
+        normals = np.concatenate([line2[:2], E.T[:2] @ self._x2])  # (4, N), of the lines in image 2, then in image 1
+        squared_norm = np.einsum("in,in->n", normals, normals)
         self._scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
+        self.residual = np.einsum("in,in->n", line2, self._x2) * self._scale
 
-    def residual(self) -> Array:
-        """Signed Sampson distances (N,), normalised."""
-        return np.asarray(self._error * self._scale)
+    def moved(self, step: Array) -> SampsonTerms:
+        """The same matches under the pose after a step (5,)."""
+        new = copy(self)
+        t = self.t + step[3:] @ _tangent_basis(self.t)
+        new._measure(rotation_from_vector(step[:3]) @ self.R, t / np.linalg.norm(t))
+        return new
 
-    def linearise(self, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Residuals (K,) of the used matches and their derivatives (K, 5), line normals held fixed."""
-        scale = self._scale[used]
-        r0, r1, r2 = (part[used] * scale for part in self._rays)
-        n0, n1, n2 = (part[used] for part in self._normals)
-        x2, y2 = self._x2[used], self._y2[used]
-        J = np.empty((len(scale), 5))
-        J[:, 0], J[:, 1], J[:, 2] = r1 * n2 - r2 * n1, r2 * n0 - r0 * n2, r0 * n1 - r1 * n0
-        J[:, 3:] = np.stack([r1 - r2 * y2, r2 * x2 - r0, r0 * y2 - r1 * x2], axis=1) @ _tangent_basis(self.t).T
-        return self._error[used] * scale, J
+    def linearise(self, used: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
+        """Residuals (N,) and their derivatives (5, N), line normals held fixed; zero for those that are not used."""
+        scale = self._scale if used is None else self._scale * used
+        rays = self.R @ self._x1  # in the second camera
+        turned = _cross(rays, self._x2)  # the derivative of the error by t
+        J = np.empty((5, len(scale)))
+        J[:3] = _cross(rays, cross_matrix(-self.t) @ self._x2)
+        J[3:] = _tangent_basis(self.t) @ turned
+        J *= scale
+        return (self.residual if used is None else self.residual * used), J
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Vector products (3, N) of columns: ``np.cross`` takes several times as long."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _truncated(residual: Array, threshold: float) -> tuple[float, NDArray[np.bool_]]:
@@ -206,8 +227,3 @@ def rotation_from_vector(vector: Array) -> Array:
     k = cross_matrix(vector / angle)
     R: Array = np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
     return R
-
-
-def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    t_new = t + step[3:] @ _tangent_basis(t)
-    return rotation_from_vector(step[:3]) @ R, t_new / np.linalg.norm(t_new)
