@@ -6,8 +6,9 @@ translation on its tangent plane (PoseLib and Hartley & Zisserman, 2nd ed., sec.
 
 from __future__ import annotations
 
-from copy import copy
+from math import hypot, sqrt
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,6 +24,8 @@ _CONVERGED_DECREASE = 1e-4
 MIN_INLIERS = 6
 # Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
 _LINEAR_DEG, _RINGS, _SPOKES, _SPREAD_ROWS = 0.1, 28, 12, 200
+# What small turns about the axes make of a vector: its products with them.
+_TURNS = np.stack([cross_matrix(axis) for axis in np.eye(3)])  # (3, 3, 3)
 # Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 REACH = 12.0
 
@@ -40,24 +43,26 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
     Returns:
         The refined R, t; its truncated cost is never above the one it started from.
     """
-    now = SampsonTerms(correspondences, R, t)
+    x1, x2 = _columns(correspondences)
+    now = SampsonTerms(x1, x2, R, t)
     reached = np.abs(now.residual) < REACH * threshold
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
     if not reached.all():
-        now = SampsonTerms(correspondences[reached], R, t)
+        x1, x2 = x1[:, reached], x2[:, reached]
+        now = SampsonTerms(x1, x2, R, t)
     cost, near = _truncated(now.residual, threshold)
     damping = _INITIAL_DAMPING
     for _ in range(rounds):
         if np.count_nonzero(near) < MIN_INLIERS:
             break
-        residual, J = now.linearise(near)
-        hessian, gradient = J @ J.T, J @ residual
+        J = now.derivatives() * near
+        hessian, gradient = J @ J.T, J @ now.residual
+        diagonal = np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
         previous = cost
         while damping < _MAX_DAMPING:
-            damped = hessian + damping * np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
-            step = -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
-            new = now.moved(step)
+            step = -np.asarray(np.linalg.solve(hessian + damping * diagonal, gradient), dtype=np.float64)
+            new = SampsonTerms(x1, x2, *_apply_step(now.R, now.t, step))
             new_cost, new_near = _truncated(new.residual, threshold)
             if new_cost < cost:
                 now, cost, near = new, new_cost, new_near
@@ -71,7 +76,7 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
 
 def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float) -> float:
     """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises."""
-    return _truncated(SampsonTerms(correspondences, R, t).residual, threshold)[0]
+    return _truncated(SampsonTerms(*_columns(correspondences), R, t).residual, threshold)[0]
 
 
 def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> float:
@@ -86,7 +91,7 @@ def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> fl
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    _, J = SampsonTerms(inliers, R, t).linearise()
+    J = SampsonTerms(*_columns(inliers), R, t).derivatives()
     curvature = float(np.linalg.eigvalsh(J @ J.T)[0])
     return float(np.clip(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 1e-3, 90.0))
 
@@ -102,7 +107,7 @@ def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) 
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    _, J = SampsonTerms(inliers, R, t).linearise()
+    J = SampsonTerms(*_columns(inliers), R, t).derivatives()
     information = J @ J.T
     rotation, cross, direction = information[:3, :3], information[:3, 3:], information[3:, 3:]
     damping = _SMALLEST_CURVATURE * np.eye(3)
@@ -143,8 +148,7 @@ def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
     x1, x2 = homogeneous_columns(rows[:, :2]), homogeneous_columns(rows[:, 2:])
     rays = R @ x1  # (3, N), in the second camera
     # Line normals in image 2, then in image 1, of unit directions: rows 0 and 1 of d × r and of Rᵀ (x2 × d).
-    units = np.stack([cross_matrix(unit) for unit in np.eye(3)])  # (3, 3, 3)
-    normals = np.concatenate([(units @ rays)[:, :2], R.T[:2] @ -(units @ x2)], axis=1)  # (3, 4, N)
+    normals = np.concatenate([(_TURNS @ rays)[:, :2], R.T[:2] @ -(_TURNS @ x2)], axis=1)  # (3, 4, N)
     forms = np.einsum("jkn,lkn->jln", normals, normals).reshape(9, -1)
     squares = np.einsum("dj,dl->djl", directions, directions).reshape(-1, 9)  # (D, 9)
     weight = 1.0 / np.maximum(squares @ forms, np.finfo(np.float64).tiny)  # (D, N)
@@ -159,43 +163,38 @@ def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
 
 
 class SampsonTerms:
-    """Sampson distances of matches (N, 4) to a pose, and how they change with it.
+    """Sampson distances of matches to a pose, and how they change with it.
+
+    Args:
+        x1, x2: (3, N) on the normalised image planes, with a row of ones.
+        R, t: the pose.
 
     Attributes:
-        R, t: the pose.
+        R, t: as given.
         residual: (N,) signed Sampson distances, normalised.
     """
 
-    def __init__(self, correspondences: Array, R: Array, t: Array) -> None:
-        self._x1, self._x2 = homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
-        self._measure(R, t)
-
-    def _measure(self, R: Array, t: Array) -> None:
+    def __init__(self, x1: Array, x2: Array, R: Array, t: Array) -> None:
         self.R, self.t = R, t
+        self._x1, self._x2 = x1, x2
         E = cross_matrix(t) @ R
-        line2 = E @ self._x1  # (3, N)
-        normals = np.concatenate([line2[:2], E.T[:2] @ self._x2])  # (4, N), of the lines in image 2, then in image 1
+        line2 = E @ x1  # (3, N)
+        normals = np.concatenate([line2[:2], E.T[:2] @ x2])  # (4, N), of the lines in image 2, then in image 1
         squared_norm = np.einsum("in,in->n", normals, normals)
         self._scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
-        self.residual = np.einsum("in,in->n", line2, self._x2) * self._scale
+        self.residual = np.einsum("in,in->n", line2, x2) * self._scale
 
-    def moved(self, step: Array) -> SampsonTerms:
-        """The same matches under the pose after a step (5,)."""
-        new = copy(self)
-        t = self.t + step[3:] @ _tangent_basis(self.t)
-        new._measure(rotation_from_vector(step[:3]) @ self.R, t / np.linalg.norm(t))
-        return new
+    def derivatives(self) -> Array:
+        """Derivatives (5, N) of the residuals by a rotation on the left of R and two steps of t, normals held fixed."""
+        T = cross_matrix(self.t)
+        across = (_tangent_basis(self.t) @ _TURNS.reshape(3, 9)).reshape(2, 3, 3)
+        of_E = np.concatenate([T @ _TURNS, across]) @ self.R  # (5, 3, 3)
+        return np.asarray(np.einsum("kin,in->kn", of_E @ self._x1, self._x2 * self._scale))
 
-    def linearise(self, used: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
-        """Residuals (N,) and their derivatives (5, N), line normals held fixed; zero for those that are not used."""
-        scale = self._scale if used is None else self._scale * used
-        rays = self.R @ self._x1  # in the second camera
-        turned = _cross(rays, self._x2)  # the derivative of the error by t
-        J = np.empty((5, len(scale)))
-        J[:3] = _cross(rays, cross_matrix(-self.t) @ self._x2)
-        J[3:] = _tangent_basis(self.t) @ turned
-        J *= scale
-        return (self.residual if used is None else self.residual * used), J
+
+def _columns(correspondences: Array) -> tuple[Array, Array]:
+    """Points of both images (3, N), (3, N) of matches (N, 4)."""
+    return homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -211,19 +210,20 @@ def _truncated(residual: Array, threshold: float) -> tuple[float, NDArray[np.boo
 
 def _tangent_basis(t: Array) -> Array:
     """Two unit vectors (2, 3) orthogonal to ``t``."""
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(t))] = 1.0
-    T = cross_matrix(t)
-    first = T @ axis
-    first /= np.linalg.norm(first)
-    return np.stack([first, T @ first])
+    x, y, z = t.tolist()
+    sizes = [abs(x), abs(y), abs(z)]
+    # Its product with the axis that it is farthest from, then with that. In plain floats: arrays of three are slow.
+    a, b, c = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[sizes.index(min(sizes))]
+    norm = hypot(a, b, c)
+    a, b, c = a / norm, b / norm, c / norm
+    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a]])
 
 
 def rotation_from_vector(vector: Array) -> Array:
     """Rotation (3, 3) about ``vector`` (3,) by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3) + cross_matrix(vector)
-    k = cross_matrix(vector / angle)
-    R: Array = np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
-    return R
+    return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
+
+
+def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
+    moved = t + step[3:] @ _tangent_basis(t)
+    return rotation_from_vector(step[:3]) @ R, moved / sqrt(moved @ moved)
