@@ -50,6 +50,8 @@ GAP_UNIT = 3.0
 # Hypotheses whose log-likelihoods differ by less are equally likely.
 TIE = 3.0
 _TINY = 1e-12
+# So many cells are counted without asking first which of them hold a match.
+_COUNTED_CELLS = 10_000
 
 FEATURES = (
     *("log count", "log weighted count", "log share", "log weighted share"),
@@ -205,7 +207,7 @@ def independent_counts(correspondences: Array, weights: Array, coefficients: Coe
     cells = np.floor((correspondences - low) / (side * np.maximum(diagonal, _TINY))).astype(np.int64)
     per_axis = int(1.0 / side) + 2
     number = cells @ np.array([1, per_axis, per_axis**2, per_axis**3])
-    _, cell = np.unique(number, return_inverse=True)
+    cell = number if per_axis**4 <= _COUNTED_CELLS else np.unique(number, return_inverse=True)[1]
     return np.asarray(np.maximum(np.bincount(cell, weights), 1.0)[cell] ** -power)
 
 

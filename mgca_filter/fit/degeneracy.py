@@ -19,7 +19,7 @@ from math import lgamma, log
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import homogeneous, sampson_distance
+from ..geometry.epipolar import homogeneous, homogeneous_columns, sampson_distance
 from ..geometry.homography import homography_distance
 from .evidence import distinct_rows
 
@@ -32,6 +32,8 @@ LOW_SUPPORT_LOG10_NFA = -1.0
 EXPLAINED_SHARE = 0.95
 EXPLAINED_THRESHOLD_FACTOR = 2.0
 MAX_ACCIDENTAL_SHARE = 0.3
+# What explains less than this part of what is asked for is no near miss.
+CLEAR_SHORTFALL = 0.8
 INTRINSICS_SUPPORT_FACTOR = 1.5
 # Keypoints are not better than this, and the median of absolute normal deviates times this is their sigma.
 LEAST_NOISE_PX = 0.1
@@ -75,8 +77,11 @@ def chance_rate(correspondences: Array, M: Array, threshold: float) -> float:
     x1, x2 = homogeneous(rows[:, :2]), homogeneous(rows[:, 2:])
     line2, line1 = x1 @ M.T, x2 @ M
     # Sampson distances of all pairings at once, (N, N): the line normals depend on one point each.
-    squared_norm = np.sum(line2[:, :2] ** 2, axis=1)[None] + np.sum(line1[:, :2] ** 2, axis=1)[:, None]
-    agreeing = (x2 @ line2.T) ** 2 < threshold**2 * squared_norm
+    limit2, limit1 = (threshold**2 * np.sum(line[:, :2] ** 2, axis=1) for line in (line2, line1))
+    excess = x2 @ line2.T  # in place from here on: memory for all pairings takes longer to get than to fill
+    excess *= excess
+    excess -= limit1[:, None]
+    agreeing = excess < limit2
     np.fill_diagonal(agreeing, False)
     # Laplace's rule: a rate that was never observed is not zero.
     return float((np.count_nonzero(agreeing) + 1.0) / (len(rows) * (len(rows) - 1) + 2.0))
@@ -164,6 +169,16 @@ def explains(distance: Array, threshold: float, support: Support) -> bool:
     return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)
 
 
+def may_explain(distance: Array, threshold: float, support: Support) -> bool:
+    """False where the best of a kind of degenerate models, by an earlier search among the same matches, falls so far
+    short that another search finds none that :func:`explains` them.
+
+    Arguments as there.
+    """
+    explained = np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold)
+    return bool(explained >= CLEAR_SHORTFALL * _wanted(len(distance), support))
+
+
 def _wanted(count: int, support: Support) -> float:
     """How many of ``count`` matches a degenerate model must explain."""
     # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
@@ -199,9 +214,11 @@ def may_only_turn(correspondences: Array, threshold: float, support: Support) ->
     half = len(correspondences) // 2
     sines = []
     for part in (correspondences[:, :2], correspondences[:, 2:]):
-        rays = _unit(homogeneous(part))
-        cosine = np.einsum("ni,ni->n", rays[:half], rays[half : 2 * half])
-        sines.append(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)))
+        rays = homogeneous_columns(part)
+        first, second = rays[:, :half], rays[:, half : 2 * half]
+        squares = np.einsum("in,in->n", rays, rays)
+        dots = np.einsum("in,in->n", first, second)
+        sines.append(np.sqrt(np.maximum(1.0 - dots**2 / (squares[:half] * squares[half : 2 * half]), 0.0)))
     # Half the root of two squared transfer errors is within d: the smaller error, and so the angle between a ray and
     # what the rotation makes of the other, is within √2 d.
     tolerance = 2.0 * np.sqrt(2.0) * EXPLAINED_THRESHOLD_FACTOR * threshold

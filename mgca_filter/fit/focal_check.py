@@ -73,11 +73,11 @@ def better_focal_factor(correspondences: Array, R: Array, t: Array, threshold: f
         A power of 1.2, rough by that much, between 0.23 and 4.3.
     """
     rows = correspondences[:_MAX_ROWS]
-    start = _promise(rows, _Trial(1.0, R, t, truncated_cost(rows, R, t, threshold)), threshold)
+    start = _promise(rows, R, t, threshold)
     if start is not None and start.worth < CLEAR_WORTH:
         return None
     given = _refined(rows, 1.0, R, t, threshold)
-    promise = _promise(rows, given, threshold)
+    promise = _promise(rows, given.R, given.t, threshold)
     if promise is None or promise.worth < 1.0:
         return None
     best = _descend(rows, given, FOCAL_STEP**promise.direction, threshold)
@@ -85,18 +85,19 @@ def better_focal_factor(correspondences: Array, R: Array, t: Array, threshold: f
     return best.factor if given.cost - best.cost > enough else None
 
 
-def _promise(rows: Array, given: _Trial, threshold: float) -> _Promise | None:
+def _promise(rows: Array, R: Array, t: Array, threshold: float) -> _Promise | None:
     """What the derivatives at a pose promise; None with too few inliers."""
-    R, T = given.R, cross_matrix(given.t)
+    T = cross_matrix(t)
     # Six small changes: three turns, two moves across t, a longer focal length. Distances have no sign, but neither
     # has the product of a distance and its derivative. Under a longer focal length the points shrink and with them the
     # unit of distances: in that of the given one they are those to an E that shrinks its points itself.
-    moves = np.linalg.svd(given.t[None])[2][1:]
+    moves = np.linalg.svd(t[None])[2][1:]
     shrink = np.diag([1.0 / (1.0 + _DIFFERENCE), 1.0 / (1.0 + _DIFFERENCE), 1.0])
-    moved = [cross_matrix(given.t + _DIFFERENCE * move) @ R for move in moves]
+    moved = [cross_matrix(t + _DIFFERENCE * move) @ R for move in moves]
     changed = np.stack([T @ R, *(T @ _SMALL_TURNS @ R), *moved, shrink @ T @ R @ shrink])  # (7, 3, 3)
     distances = sampson_distance(rows, changed)  # (7, N)
-    distances = distances[:, distances[0] < threshold]
+    near = distances[0] < threshold
+    distances = distances[:, near]
     distance = distances[0]
     if len(distance) < MIN_INLIERS:
         return None
@@ -106,7 +107,8 @@ def _promise(rows: Array, given: _Trial, threshold: float) -> _Promise | None:
     pose_step = np.linalg.lstsq(hessian[:5, :5], gradient[:5], rcond=None)[0]
     gain = float(gradient @ step - gradient[:5] @ pose_step)
     variance = float(np.mean(distance**2))
-    worth = gain / max(MIN_PROMISED_SHARE * given.cost, MIN_PROMISED_VARIANCES * variance, 1e-300)
+    cost = len(distance) * variance + np.count_nonzero(~near) * threshold**2
+    worth = gain / max(MIN_PROMISED_SHARE * cost, MIN_PROMISED_VARIANCES * variance, 1e-300)
     return _Promise(worth, -1.0 if step[5] > 0 else 1.0, variance)
 
 

@@ -7,7 +7,7 @@ inliers hold it firmly. Otherwise unlike sources propose; where the first of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import acos, degrees
 
 import numpy as np
@@ -99,6 +99,7 @@ class TwoViewModel:
         ended: ``"before the network"``, ``"first sources"`` or ``"all sources"``.
         confidence: probability that the pose is within 10 degrees; None with guessed intrinsics.
         judgement: the measurements behind the choice; None likewise.
+        plane: homography (3, 3) of the dominant plane among its inliers, where it was looked for; else None.
     """
 
     M: Array
@@ -109,6 +110,7 @@ class TwoViewModel:
     ended: str
     confidence: float | None = None
     judgement: Judgement | None = None
+    plane: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,7 @@ class Search:
         self._coefficients, self._options, self._plan = coefficients, options, plan
         self._poses: list[_Pose] = []
         self._twins_of: _Pose | None = None
+        self._plane: Array | None = None
         self._judgement: Judgement | None = None
         self._take(evidence)
 
@@ -154,7 +157,10 @@ class Search:
         self._propose_twins()
         model = self.current("before the network")
         judgement = None if model is None else model.judgement
-        return model if judgement is not None and choice.explains_list(judgement, self._coefficients) else None
+        if model is None or judgement is None or not choice.explains_list(judgement, self._coefficients):
+            return None
+        same = self._twins_of is not None and _angle_deg(self._twins_of, self._best()) < TWIN_DEG
+        return replace(model, plane=self._plane) if same else model
 
     def with_network(self, evidence: Evidence) -> TwoViewModel | None:
         """The model by all sources, on scored matches; None where nothing is found."""
@@ -215,10 +221,8 @@ class Search:
         if self._twins_of is not None and _angle_deg(self._twins_of, best) < TWIN_DEG:
             return
         self._twins_of = best
-        found = [
-            pose_from_essential(E, self._fitted, self._evidence.focal_px)
-            for E in sources.plane(self._evidence, best.R, best.t, self._options.seed)
-        ]
+        self._plane = sources.dominant_plane(self._evidence, best.R, best.t, self._options.seed)
+        found = [pose_from_essential(E, self._fitted, self._evidence.focal_px) for E in sources.plane(self._plane)]
         twins = [_Pose(*pose, Family.PLANE, "plane") for pose in found if pose is not None]
         near = self._near([best, *twins], self._fitted, TWIN_PX)
         for twin, count in zip(twins, near[1:]):

@@ -112,7 +112,7 @@ def judge(
     factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
     if factor is not None:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
-    return _test_plane(pair, evidence, inlier_rows, support, options, verdict)
+    return _test_plane(pair, model, evidence, inlier_rows, support, options, verdict)
 
 
 def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: float, options: FilterOptions) -> Verdict:
@@ -206,7 +206,8 @@ def _test_rotation(
         fitted_rows: (N,) rows of the pair's matches that bear witness.
         near: (N,) bool, those of them that agree with the model.
     """
-    shortest_px = 1.0 / max(np.linalg.norm(np.linalg.inv(K[:2, :2]), 2) for K in (pair.intrinsics1.K, pair.intrinsics2.K))
+    zooms = np.stack([camera.K[:2, :2] for camera in (pair.intrinsics1, pair.intrinsics2)])
+    shortest_px = float(np.linalg.svd(zooms, compute_uv=False).min())
     if not degeneracy.may_only_turn(pair.correspondences[fitted_rows], REFINE_PX / shortest_px, support):
         return None
     R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
@@ -223,6 +224,7 @@ def _test_rotation(
 
 def _test_plane(
     pair: PairInput,
+    model: TwoViewModel,
     evidence: Evidence,
     inlier_rows: NDArray[np.intp],
     support: degeneracy.Support,
@@ -231,6 +233,10 @@ def _test_plane(
 ) -> Verdict:
     """The verdict with the homography that explains the inliers as well, where there is one."""
     points1, points2 = pair.pixels(inlier_rows)
+    if model.plane is not None:
+        found = pair.intrinsics2.K @ model.plane @ np.linalg.inv(pair.intrinsics1.K)
+        if not degeneracy.may_explain(homography_distance(points1, points2, found), REFINE_PX, support):
+            return verdict
     quick = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * REFINE_PX, options.seed)
     if quick is None or not degeneracy.explains(homography_distance(points1, points2, quick), REFINE_PX, support):
         return verdict
