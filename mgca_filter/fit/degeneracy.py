@@ -14,7 +14,7 @@ Every rule asks for nearly all of the evidence, so that an ordinary pair stays `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import lgamma, log
+from math import lgamma, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -182,13 +182,13 @@ def may_explain(distance: Array, threshold: float, support: Support) -> bool:
 def _wanted(count: int, support: Support) -> float:
     """How many of ``count`` matches a degenerate model must explain."""
     # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
-    accidents = support.chance_count + 2.0 * np.sqrt(support.chance_count)
+    accidents = support.chance_count + 2.0 * sqrt(support.chance_count)
     count = min(count, support.count)
     return EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
 
 
 def may_lie_on_line(points: Array, threshold: float, support: Support) -> bool:
-    """False where no line explains points (N, 2), told by a third of the work of finding the best: see :func:`explains`.
+    """False where no line explains points (N, 2), told without finding the best: see :func:`explains`.
 
     The least height of a triangle of points within d of one line is at most 2 d, and each point off the line spoils at
     most one of N / 3 triangles that share none.

@@ -64,6 +64,8 @@ class Intrinsics:
 
     def normalize(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (N, 2) to the normalised image plane (N, 2), distortion removed; NaN where that fails."""
+        if self.distortion is None and np.isfinite(points).all():
+            return normalize_points(points, self.K)
         normalized = np.full(points.shape, np.nan)
         finite = np.isfinite(points).all(axis=1)
         if self.distortion is None:

@@ -62,7 +62,7 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
         previous = cost
         while damping < _MAX_DAMPING:
             step = -np.asarray(np.linalg.solve(hessian + damping * diagonal, gradient), dtype=np.float64)
-            new = SampsonTerms(x1, x2, *_apply_step(now.R, now.t, step))
+            new = SampsonTerms(x1, x2, *apply_step(now.R, now.t, step))
             new_cost, new_near = _truncated(new.residual, threshold)
             if new_cost < cost:
                 now, cost, near = new, new_cost, new_near
@@ -128,7 +128,7 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     ring, spoke = np.repeat(np.arange(_RINGS), _SPOKES), np.tile(np.arange(_SPOKES), _RINGS)
     offsets = across[spoke] @ _tangent_basis(t)
     directions = np.cos(angle[ring])[:, None] * t + np.sin(angle[ring])[:, None] * offsets  # (D, 3)
-    costs = _costs_of_directions(rows, R, np.vstack([t, directions]))
+    costs = costs_of_directions(rows, R, np.vstack([t, directions]))
     costs = step * (costs[1:] - costs[0])
     log_weights = -0.5 * costs / noise**2 + np.log(np.sin(angle[ring]) * width[ring])
     weights = np.exp(log_weights - log_weights.max())
@@ -137,7 +137,7 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     return float(min(np.degrees(np.sqrt(np.linalg.eigvalsh(moments)[1])), 90.0))
 
 
-def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
+def costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
     """Summed squared Sampson distances (D,) of matches (N, 4) to poses with directions (D, 3), the rotation moved from
     R as each likes best, to first order.
 
@@ -224,6 +224,7 @@ def rotation_from_vector(vector: Array) -> Array:
     return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
 
 
-def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
+def apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
+    """The pose after a step (5,): a rotation vector on the left of R, then two moves across ``t``."""
     moved = t + step[3:] @ _tangent_basis(t)
     return rotation_from_vector(step[:3]) @ R, moved / sqrt(moved @ moved)
