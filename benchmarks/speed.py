@@ -6,7 +6,10 @@ measured in processes of their own. ``benchmarks.profile_network`` tells where t
 
 ``--bundles FOLDER …`` prints another table instead: on one thread, the whole call on the lists that users make of the
 matches, and what remains of it without the network, as multiples of USAC_MAGSAC's 5000 iterations on the same list.
-Raw lists are told apart by whether MAGSAC's first short run explains them, so that the network is not asked.
+Raw lists are told apart by whether MAGSAC's first short run explains them, so that the network is not asked. Of
+filtered lists of which most is right a second table tells the ratio by length. Easy lists alone, in a few minutes:
+
+    python -m benchmarks.speed --bundles FOLDER --detectors SIFT-2000 --kinds cross-ratio --per-scene 1
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -198,15 +201,17 @@ def network_calls(count: int) -> dict[str, Callable[[], Any]]:
     return calls
 
 
-def median_ms(calls: dict[str, Callable[[], Any]], repeats: int) -> dict[str, float]:
+def median_ms(
+    calls: dict[str, Callable[[], Any]], repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, float]:
     """Median duration of each call; they take turns, so that a busy moment hits all."""
     times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(repeats + 1):
         for name, call in calls.items():
-            started = time.perf_counter()
+            started = clock()
             call()
             if turn:  # the first one warms up
-                times[name].append(1e3 * (time.perf_counter() - started))
+                times[name].append(1e3 * (clock() - started))
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
@@ -244,7 +249,8 @@ def print_cold_start_and_memory(names: list[str]) -> None:
 
 @dataclass(frozen=True)
 class ListTime:
-    """Times of one list: of the filter's whole call, of its forward pass, and of USAC_MAGSAC at half a pixel; medians.
+    """Processor times of one list, on one thread, so that other programs do not count: of the filter's whole call, of
+    its forward pass, and of USAC_MAGSAC at half a pixel; medians.
 
     ``network_ms`` is 0 where the search ended before the network; ``right_share`` is 0 … 1.
     """
@@ -279,12 +285,22 @@ RATIO_TARGETS = {RAW_NETWORK: "0.6", RAW_EARLY: MISSING, CLEAR: "2", FILTERED: "
 """Groups of lists, and the ratio to MAGSAC's time that none should pass."""
 
 
-def time_lists(scenes: Sequence[DetectorScene], repeats: int, model: str | None = None) -> list[ListTime]:
-    """Times on every kind of list of every pair; lists of fewer than eight matches are left out."""
+LENGTHS = (350, 750, 1250, CLEAR_COUNTS[1] + 1)
+"""Clear lists are told apart by their length: each is shorter than the first of these that it can be."""
+
+
+def time_lists(
+    scenes: Sequence[DetectorScene], repeats: int, model: str | None = None, kinds: Collection[str] = tuple(KINDS)
+) -> list[ListTime]:
+    """Times on every kind of list of every pair, or on some; lists of fewer than eight matches are left out."""
     match_filter = MatchFilter(model=model, backend="onnxruntime")
     times = []
     for scene in tqdm(scenes, disable=None, unit=" bundles"):
-        selections = [(kind, selection) for kind in KINDS.values() if (selection := scene.lists(kind)) is not None]
+        selections = [
+            (kind, selection)
+            for kind in map(KINDS.get, kinds)
+            if kind is not None and (selection := scene.lists(kind)) is not None
+        ]
         for kind, selection in selections:
             for pair in sample_pairs([selection], len(selection)):
                 if len(pair.points1) >= MIN_MATCHES:
@@ -294,16 +310,18 @@ def time_lists(scenes: Sequence[DetectorScene], repeats: int, model: str | None 
 
 def time_list(match_filter: MatchFilter, pair: ScenePair, family: str, repeats: int) -> ListTime:
     """Times of one list."""
-    given, network_ms = match_pair(pair), []
+    given, network_shares = match_pair(pair), []
 
     def call() -> None:
         (result,) = match_filter.filter_many([given])
-        network_ms.append(result.info["timings_ms"].get("network", 0.0))
+        taken = result.info["timings_ms"]
+        network_shares.append(taken.get("network", 0.0) / taken["total"])
 
-    ms = median_ms({"filter": call, "magsac": partial(magsac, pair, 5000, 0.5, 0.9999)}, repeats)
+    calls: dict[str, Callable[[], Any]] = {"filter": call, "magsac": partial(magsac, pair, 5000, 0.5, 0.9999)}
+    ms = median_ms(calls, repeats, time.process_time)
     truth = true_matches(pair.correspondences, pair.E)
-    passes_ms = float(np.median(network_ms[1:]))  # the first one warms up
-    return ListTime(family, len(truth), float(truth.mean()), ms["filter"], passes_ms, ms["magsac"])
+    network_ms = ms["filter"] * float(np.median(network_shares[1:]))  # the first one warms up
+    return ListTime(family, len(truth), float(truth.mean()), ms["filter"], network_ms, ms["magsac"])
 
 
 def ratio_table(times: Sequence[ListTime]) -> str:
@@ -331,16 +349,35 @@ def ratio_table(times: Sequence[ListTime]) -> str:
     return render_table(header, rows)
 
 
+def length_table(times: Sequence[ListTime]) -> str:
+    """The clear lists by length: how many ended before the network, and the ratios of those."""
+    rows = []
+    shortest = CLEAR_COUNTS[0]
+    for limit in LENGTHS:
+        chosen = [one for one in times if one.group == CLEAR and shortest <= one.matches < limit]
+        early = [one for one in chosen if one.network_ms == 0.0]
+        if early:
+            ours, theirs = (np.array([getattr(one, f"{name}_ms") for one in early]) for name in ("filter", "magsac"))
+            ratios = (np.median(ours / theirs), ours.sum() / theirs.sum())
+            cells = [f"{shortest} to {limit - 1}", str(len(chosen)), str(len(early))]
+            cells += [f"{np.median(values):.1f}" for values in (ours, theirs)]
+            rows.append([*cells, *(f"{ratio:.2f}" for ratio in ratios)])
+        shortest = limit
+    header = ["matches", "lists", "before the network", "filter, ms", "MAGSAC, ms", "median of ratios", "ratio of sums"]
+    return render_table(header, rows)
+
+
 def print_list_ratios(options: argparse.Namespace) -> None:
-    """The table of ``--bundles``."""
+    """The tables of ``--bundles``."""
     chosen = (options.detectors, None, options.per_scene)
     scenes = open_detector_scenes(options.bundles, *chosen)
     meter = CpuMeter()
     with one_thread():
-        times = time_lists(scenes, options.repeats, options.model)
+        times = time_lists(scenes, options.repeats, options.model, options.kinds)
     print(
         "Whole calls against USAC_MAGSAC (0.5 px, confidence 0.9999, 5000 iterations) on the same list, one thread, in "
-        f"turn, medians; other programs used {meter.others_load():.1f} processors meanwhile.\n\n{ratio_table(times)}"
+        f"turn, processor time, medians; other programs used {meter.others_load():.1f} processors meanwhile.\n\n"
+        f"{ratio_table(times)}\n\nOf the {CLEAR}, those that ended before the network:\n\n{length_table(times)}"
     )
 
 
@@ -356,6 +393,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--per-scene", type=int, metavar="N", help="with --bundles: at most N pairs of each")
     parser.add_argument("--detectors", nargs="+", metavar="NAME", help="with --bundles: these alone")
+    parser.add_argument(
+        "--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="with --bundles: these lists alone"
+    )
     parser.add_argument(
         "--model", metavar="FILE", help="with --bundles: of the filter (default: the one in the package)"
     )

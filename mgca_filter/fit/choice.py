@@ -21,6 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.epipolar import cross_matrix, homogeneous_columns, sampson_distance
 from ..geometry.pose_refinement import pose_uncertainty_deg
 
 Array = NDArray[np.float64]
@@ -29,6 +30,8 @@ Coefficients = Mapping[str, Sequence[float]]
 
 # The signs of depths say something only where the rays are this far from parallel, pixels.
 MIN_PARALLAX_PX = 1.5
+# Matches within this distance, pixels, are explained.
+INLIER_PX = 1.0
 # Without scores the share of right matches is at least and at most this.
 MIN_SHARE, MAX_SHARE = 0.02, 0.8
 # Residuals between these, pixels, say how densely wrong matches lie around an epipolar line.
@@ -47,6 +50,8 @@ GAP_UNIT = 3.0
 # Hypotheses whose log-likelihoods differ by less are equally likely.
 TIE = 3.0
 _TINY = 1e-12
+# So many cells are counted without asking first which of them hold a match.
+_COUNTED_CELLS = 10_000
 
 FEATURES = (
     *("log count", "log weighted count", "log share", "log weighted share"),
@@ -162,22 +167,21 @@ class Judgement:
 
 def measure_residuals(correspondences: Array, R: Array, t: Array, focal_px: float) -> Residuals:
     """Residuals of poses R (H, 3, 3), t (H, 3) on matches (N, 4) of the normalised image planes."""
-    x1, y1, x2, y2 = (np.ascontiguousarray(column) for column in correspondences.T)  # (N,) each
-    rays = R @ np.stack([x1, y1, np.ones_like(x1)])  # (H, 3, N), of image 1 in the second camera
-    r0, r1, r2 = rays[:, 0], rays[:, 1], rays[:, 2]  # (H, N)
-    t0, t1, t2 = (t[:, i, None] for i in range(3))
-    l0, l1, l2 = t1 * r2 - t2 * r1, t2 * r0 - t0 * r2, t0 * r1 - t1 * r0  # epipolar lines t × R x1 in image 2
-    error = l0 * x2 + l1 * y2 + l2
-    n0, n1, n2 = y2 * t2 - t1, t0 - x2 * t2, x2 * t1 - y2 * t0  # x2 × t; lines in image 1 are Rᵀ of it
-    m0 = R[:, 0, 0, None] * n0 + R[:, 1, 0, None] * n1 + R[:, 2, 0, None] * n2
-    m1 = R[:, 0, 1, None] * n0 + R[:, 1, 1, None] * n1 + R[:, 2, 1, None] * n2
-    squared_norm = np.maximum(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1, np.finfo(np.float64).tiny)
-    distance_px = np.abs(error) * (focal_px / np.sqrt(squared_norm))
-    aa, bb = x1 * x1 + y1 * y1 + 1.0, x2 * x2 + y2 * y2 + 1.0  # a rotation keeps the length of a ray
-    ab = r0 * x2 + r1 * y2 + r2
-    at, bt = r0 * t0 + r1 * t1 + r2 * t2, x2 * t0 + y2 * t1 + t2
-    parallax = aa * bb - ab * ab > (MIN_PARALLAX_PX / focal_px) ** 2 * aa * bb
-    return Residuals(distance_px, ((ab * bt < bb * at) | (aa * bt < ab * at)) & parallax)
+    E = np.stack([cross_matrix(one) for one in t]) @ R
+    distance_px = sampson_distance(correspondences, E) * focal_px
+    return Residuals(distance_px, lie_behind(correspondences, R, t, focal_px))
+
+
+def lie_behind(correspondences: Array, R: Array, t: Array, focal_px: float) -> BoolArray:
+    """Which matches (N, 4) lie behind a camera under poses R (H, 3, 3), t (H, 3), (H, N); see :class:`Residuals`."""
+    x1, x2 = homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
+    # A rotation keeps the length of a ray, and its product with t.
+    aa, bb = np.einsum("in,in->n", x1, x1), np.einsum("in,in->n", x2, x2)
+    ab = np.einsum("hin,in->hn", R @ x1, x2)
+    at, bt = (t[:, None] @ R)[:, 0] @ x1, t @ x2
+    both = aa * bb
+    parallax = both - ab * ab > (MIN_PARALLAX_PX / focal_px) ** 2 * both
+    return np.asarray(((ab * bt < bb * at) | (aa * bt < ab * at)) & parallax)
 
 
 def pairwise_angles_deg(R: Array, t: Array, R_other: Array, t_other: Array) -> Array:
@@ -203,7 +207,7 @@ def independent_counts(correspondences: Array, weights: Array, coefficients: Coe
     cells = np.floor((correspondences - low) / (side * np.maximum(diagonal, _TINY))).astype(np.int64)
     per_axis = int(1.0 / side) + 2
     number = cells @ np.array([1, per_axis, per_axis**2, per_axis**3])
-    _, cell = np.unique(number, return_inverse=True)
+    cell = number if per_axis**4 <= _COUNTED_CELLS else np.unique(number, return_inverse=True)[1]
     return np.asarray(np.maximum(np.bincount(cell, weights), 1.0)[cell] ** -power)
 
 
@@ -278,7 +282,7 @@ def judge(
     residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px)
     distance, front = residuals.distance_px, ~residuals.behind
     count = len(correspondences)
-    near = (distance < 1.0) & front  # (H, N)
+    near = (distance < INLIER_PX) & front  # (H, N)
     inliers = near.sum(axis=1)
     share = float(np.clip(inliers.max() / max(count, 1), MIN_SHARE, MAX_SHARE))
     weights = np.full(count, share) if scores is None else scores
@@ -323,11 +327,11 @@ def judge(
         hypotheses.t[chosen],
         NOISE_PX * scale / focal_px,
     )
-    everything_near = int(np.count_nonzero(distance[chosen] < 1.0))
+    everything_near = int(np.count_nonzero(distance[chosen] < INLIER_PX))
     features = {
         "log count": np.log(number + 1.0),
         "log weighted count": np.log(weighted + 1.0),
-        "log share": np.log((number + 1.0) / (count + 2.0)),
+        "log share": np.log(explained_share(number, count)),
         "log weighted share": np.log((weighted + 0.1) / (weights.sum() + 0.2)),
         "log significance": _significance(number, background[0]),
         "log weighted significance": _significance(weighted, background[1]),
@@ -349,6 +353,11 @@ def judge(
     }
     distances = np.where(front[chosen], distance[chosen], np.inf)
     return Judgement(chosen, {k: float(v) for k, v in features.items()}, likelihood, distances, share, scale)
+
+
+def explained_share(inliers: float, count: int) -> float:
+    """Share of ``count`` matches that a pose explains, by Laplace's rule."""
+    return (inliers + 1.0) / (count + 2.0)
 
 
 def confidence(judgement: Judgement, coefficients: Coefficients) -> float:
@@ -397,11 +406,12 @@ def posterior(residuals: Residuals, groups: Sequence[BoolArray], scale: float, c
     ratio = ratio * np.where(residuals.behind[0], coefficients["seen_behind"][0], 1.0)
     probability = np.zeros_like(squared)
     for group in groups:
-        share = 0.5
-        for _ in range(_SHARE_ROUNDS if group.any() else 0):
-            odds = share / (1.0 - share) * ratio[group]
-            probability[group] = odds / (1.0 + odds)
-            share = float(np.clip(probability[group].mean(), _LEAST_SHARE, _LARGEST_SHARE))
+        share, of_group = 0.5, ratio[group]
+        for _ in range(_SHARE_ROUNDS if len(of_group) else 0):
+            odds = share / (1.0 - share) * of_group
+            right = odds / (1.0 + odds)
+            share = min(max(float(right.mean()), _LEAST_SHARE), _LARGEST_SHARE)
+            probability[group] = right
     return np.asarray(probability)
 
 

@@ -14,12 +14,12 @@ Every rule asks for nearly all of the evidence, so that an ordinary pair stays `
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import lgamma, log
+from math import lgamma, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import homogeneous, sampson_distance
+from ..geometry.epipolar import homogeneous, homogeneous_columns, sampson_distance
 from ..geometry.homography import homography_distance
 from .evidence import distinct_rows
 
@@ -32,6 +32,8 @@ LOW_SUPPORT_LOG10_NFA = -1.0
 EXPLAINED_SHARE = 0.95
 EXPLAINED_THRESHOLD_FACTOR = 2.0
 MAX_ACCIDENTAL_SHARE = 0.3
+# What explains less than this part of what is asked for is no near miss.
+CLEAR_SHORTFALL = 0.8
 INTRINSICS_SUPPORT_FACTOR = 1.5
 # Keypoints are not better than this, and the median of absolute normal deviates times this is their sigma.
 LEAST_NOISE_PX = 0.1
@@ -75,8 +77,11 @@ def chance_rate(correspondences: Array, M: Array, threshold: float) -> float:
     x1, x2 = homogeneous(rows[:, :2]), homogeneous(rows[:, 2:])
     line2, line1 = x1 @ M.T, x2 @ M
     # Sampson distances of all pairings at once, (N, N): the line normals depend on one point each.
-    squared_norm = np.sum(line2[:, :2] ** 2, axis=1)[None] + np.sum(line1[:, :2] ** 2, axis=1)[:, None]
-    agreeing = (x2 @ line2.T) ** 2 < threshold**2 * squared_norm
+    limit2, limit1 = (threshold**2 * np.sum(line[:, :2] ** 2, axis=1) for line in (line2, line1))
+    excess = x2 @ line2.T  # in place from here on: memory for all pairings takes longer to get than to fill
+    excess *= excess
+    excess -= limit1[:, None]
+    agreeing = excess < limit2
     np.fill_diagonal(agreeing, False)
     # Laplace's rule: a rate that was never observed is not zero.
     return float((np.count_nonzero(agreeing) + 1.0) / (len(rows) * (len(rows) - 1) + 2.0))
@@ -160,8 +165,62 @@ def explains(distance: Array, threshold: float, support: Support) -> bool:
         threshold: inlier threshold, in the unit of ``distance``; twice as much is allowed.
         support: of the general model that the inliers agree with.
     """
-    # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
-    accidents = support.chance_count + 2.0 * np.sqrt(support.chance_count)
-    count = min(len(distance), support.count)
-    wanted = EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
+    wanted = _wanted(len(distance), support)
     return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)
+
+
+def may_explain(distance: Array, threshold: float, support: Support) -> bool:
+    """False where the best of a kind of degenerate models, by an earlier search among the same matches, falls so far
+    short that another search finds none that :func:`explains` them.
+
+    Arguments as there.
+    """
+    explained = np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold)
+    return bool(explained >= CLEAR_SHORTFALL * _wanted(len(distance), support))
+
+
+def _wanted(count: int, support: Support) -> float:
+    """How many of ``count`` matches a degenerate model must explain."""
+    # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
+    accidents = support.chance_count + 2.0 * sqrt(support.chance_count)
+    count = min(count, support.count)
+    return EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
+
+
+def may_lie_on_line(points: Array, threshold: float, support: Support) -> bool:
+    """False where no line explains points (N, 2), told without finding the best: see :func:`explains`.
+
+    The least height of a triangle of points within d of one line is at most 2 d, and each point off the line spoils at
+    most one of N / 3 triangles that share none.
+    """
+    third = len(points) // 3
+    a, b, c = points[:third], points[third : 2 * third], points[2 * third : 3 * third]
+    sides = np.stack([b - a, c - b, a - c])  # (3, T, 2)
+    twice_area = np.abs(sides[0, :, 0] * sides[1, :, 1] - sides[0, :, 1] * sides[1, :, 0])
+    longest = np.sqrt(np.einsum("stk,stk->st", sides, sides).max(axis=0))
+    flat = twice_area <= 2.0 * EXPLAINED_THRESHOLD_FACTOR * threshold * longest
+    return bool(third - np.count_nonzero(flat) <= len(points) - _wanted(len(points), support))
+
+
+def may_only_turn(correspondences: Array, threshold: float, support: Support) -> bool:
+    """False where no rotation explains matches (N, 4), told without finding one: see :func:`explains`.
+
+    A rotation keeps the angles between viewing rays, and each match that disagrees spoils at most one of N / 2 pairs of
+    matches that share none.
+
+    Args:
+        threshold: inlier threshold, pixels over the shortest focal length.
+    """
+    half = len(correspondences) // 2
+    sines = []
+    for part in (correspondences[:, :2], correspondences[:, 2:]):
+        rays = homogeneous_columns(part)
+        first, second = rays[:, :half], rays[:, half : 2 * half]
+        squares = np.einsum("in,in->n", rays, rays)
+        dots = np.einsum("in,in->n", first, second)
+        sines.append(np.sqrt(np.maximum(1.0 - dots**2 / (squares[:half] * squares[half : 2 * half]), 0.0)))
+    # Half the root of two squared transfer errors is within d: the smaller error, and so the angle between a ray and
+    # what the rotation makes of the other, is within √2 d.
+    tolerance = 2.0 * np.sqrt(2.0) * EXPLAINED_THRESHOLD_FACTOR * threshold
+    alike = np.abs(sines[0] - sines[1]) <= tolerance
+    return bool(half - np.count_nonzero(alike) <= len(correspondences) - _wanted(len(correspondences), support))

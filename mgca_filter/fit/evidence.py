@@ -80,11 +80,12 @@ def gather_before(pair: PairInput) -> Evidence:
     listed = listed_rows(pair.attributes, pair.valid)
     rows = np.flatnonzero(listed)
     rows = rows[np.argsort(np.nan_to_num(pair.order[rows], nan=np.inf), kind="stable")]
-    rows = rows[np.sort(distinct_rows(pair.correspondences[rows]))]
+    rows = rows[first_of_each(pair.correspondences[rows])]
+    correspondences = pair.correspondences[rows]
     return Evidence(
         rows,
-        np.ascontiguousarray(pair.correspondences[rows]),
-        one_to_one(pair.correspondences[rows]),
+        correspondences,
+        one_to_one(correspondences),
         np.ones(len(rows), dtype=bool),
         pair.order[rows],
         pair.focal_px,
@@ -109,11 +110,12 @@ def gather_scored(
     attributes = pair.attributes[candidates]
     ratio, known = attributes[:, Column.RATIO], attributes[:, Column.RATIO_KNOWN] > 0
     rows = candidates[match_order(margins[candidates], ratio, known)]
-    rows = rows[np.sort(distinct_rows(pair.correspondences[rows]))]
+    rows = rows[first_of_each(pair.correspondences[rows])]
+    correspondences = pair.correspondences[rows]
     return Evidence(
         rows,
-        np.ascontiguousarray(pair.correspondences[rows]),
-        one_to_one(pair.correspondences[rows]),
+        correspondences,
+        one_to_one(correspondences),
         listed_rows(pair.attributes, pair.valid)[rows],
         pair.order[rows],
         pair.focal_px,
@@ -155,10 +157,18 @@ def one_to_one(correspondences: Array) -> NDArray[np.bool_]:
     """Of distinct matches (N, 4), best first, those (N,) whose points in either image stand in no better one."""
     rows = np.arange(len(correspondences))
     for columns in (slice(0, 2), slice(2, 4)):
-        rows = rows[np.sort(distinct_rows(correspondences[rows, columns]))]
+        rows = rows[first_of_each(correspondences[rows, columns])]
     chosen = np.zeros(len(correspondences), dtype=bool)
     chosen[rows] = True
     return chosen
+
+
+def first_of_each(rows: Array) -> NDArray[np.intp]:
+    """Positions of the distinct rows of finite (N, D) in the order of the list; of equal rows the first counts."""
+    column = np.sort(rows[:, 0])
+    if (column[1:] != column[:-1]).all():
+        return np.arange(len(rows))
+    return np.sort(distinct_rows(rows))
 
 
 def distinct_rows(rows: Array) -> NDArray[np.intp]:
@@ -166,7 +176,16 @@ def distinct_rows(rows: Array) -> NDArray[np.intp]:
 
     ``np.unique`` does the same for rows in several times the time.
     """
-    ascending = np.lexsort(rows.T[::-1])  # stable: of equal rows the first stays first
+    ascending = np.argsort(rows[:, 0])
+    column = rows[ascending, 0]
+    equal = np.zeros(len(rows) + 1, dtype=bool)  # to the row before
+    equal[1:-1] = column[1:] == column[:-1]
+    tied = equal[1:] | equal[:-1]
+    if not tied.any():
+        return ascending
+    # The other columns matter among rows whose first is equal, which stand side by side.
+    among = np.sort(ascending[tied])
+    ascending[tied] = among[np.lexsort(rows[among].T[::-1])]  # stable: of equal rows the first stays first
     first = np.ones(len(rows), dtype=bool)
     first[1:] = np.any(rows[ascending[1:]] != rows[ascending[:-1]], axis=1)
     return ascending[first]

@@ -25,12 +25,15 @@ FOCAL_STEP = 1.2
 MIN_GAIN_SHARE, MIN_GAIN_VARIANCES = 0.35, 20.0
 # It is tried where the derivatives promise this much: three quarters of the pairs with a right one end here.
 MIN_PROMISED_SHARE, MIN_PROMISED_VARIANCES = 0.01, 4.0
+# With less than this part of it before the pose is refined on the same matches no refinement is needed.
+CLEAR_WORTH = 0.5
 # The pose under another focal length lies further off than a fine threshold lets refinement see.
 COARSE_FACTOR = 16.0
 _COARSE_ROUNDS = 5
 _MAX_ROWS = 500
 _MAX_STEPS = 8
 _DIFFERENCE = 1e-7
+_SMALL_TURNS = np.stack([rotation_from_vector(_DIFFERENCE * axis) for axis in np.eye(3)])
 
 
 @dataclass(frozen=True)
@@ -41,6 +44,21 @@ class _Trial:
     R: Array
     t: Array
     cost: float
+
+
+@dataclass(frozen=True)
+class _Promise:
+    """What a Gauss-Newton step takes off the squared distances of the inliers if it may change the focal length.
+
+    Attributes:
+        worth: the gain beyond that of a step on the pose alone, as a multiple of what makes it worth a try.
+        direction: 1 or -1, whether the step makes the focal length longer.
+        variance: of the inliers' distances.
+    """
+
+    worth: float
+    direction: float
+    variance: float
 
 
 def better_focal_factor(correspondences: Array, R: Array, t: Array, threshold: float) -> float | None:
@@ -55,41 +73,43 @@ def better_focal_factor(correspondences: Array, R: Array, t: Array, threshold: f
         A power of 1.2, rough by that much, between 0.23 and 4.3.
     """
     rows = correspondences[:_MAX_ROWS]
+    start = _promise(rows, R, t, threshold)
+    if start is not None and start.worth < CLEAR_WORTH:
+        return None
     given = _refined(rows, 1.0, R, t, threshold)
-    distance = sampson_distance(rows, cross_matrix(given.t) @ given.R)
-    near = distance < threshold
-    if np.count_nonzero(near) < MIN_INLIERS:
+    promise = _promise(rows, given.R, given.t, threshold)
+    if promise is None or promise.worth < 1.0:
         return None
-    variance = float(np.mean(distance[near] ** 2))
-    promised, direction = _promised_gain(rows[near], given)
-    if promised < max(MIN_PROMISED_SHARE * given.cost, MIN_PROMISED_VARIANCES * variance):
-        return None
-    best = _descend(rows, given, FOCAL_STEP**direction, threshold)
-    enough = max(MIN_GAIN_SHARE * given.cost, MIN_GAIN_VARIANCES * variance)
+    best = _descend(rows, given, FOCAL_STEP**promise.direction, threshold)
+    enough = max(MIN_GAIN_SHARE * given.cost, MIN_GAIN_VARIANCES * promise.variance)
     return best.factor if given.cost - best.cost > enough else None
 
 
-def _promised_gain(near: Array, given: _Trial) -> tuple[float, float]:
-    """What a Gauss-Newton step takes off the squared distances of the inliers (K, 4) if it may change the focal length.
-
-    Returns:
-        The gain beyond that of a step on the pose alone, and 1 or −1: whether the step makes the focal length longer.
-    """
-    R, t = given.R, given.t
+def _promise(rows: Array, R: Array, t: Array, threshold: float) -> _Promise | None:
+    """What the derivatives at a pose promise; None with too few inliers."""
     T = cross_matrix(t)
     # Six small changes: three turns, two moves across t, a longer focal length. Distances have no sign, but neither
-    # has the product of a distance and its derivative.
+    # has the product of a distance and its derivative. Under a longer focal length the points shrink and with them the
+    # unit of distances: in that of the given one they are those to an E that shrinks its points itself.
     moves = np.linalg.svd(t[None])[2][1:]
-    changed = [T @ rotation_from_vector(_DIFFERENCE * axis) @ R for axis in np.eye(3)]
-    changed += [cross_matrix(t + _DIFFERENCE * move) @ R for move in moves]
-    longer = 1.0 + _DIFFERENCE
-    distance = sampson_distance(near, T @ R)
-    columns = [sampson_distance(near, E) for E in changed] + [sampson_distance(near / longer, T @ R) * longer]
-    jacobian = (np.stack(columns, axis=1) - distance[:, None]) / _DIFFERENCE
-    hessian, gradient = jacobian.T @ jacobian, jacobian.T @ distance
+    shrink = np.diag([1.0 / (1.0 + _DIFFERENCE), 1.0 / (1.0 + _DIFFERENCE), 1.0])
+    moved = [cross_matrix(t + _DIFFERENCE * move) @ R for move in moves]
+    changed = np.stack([T @ R, *(T @ _SMALL_TURNS @ R), *moved, shrink @ T @ R @ shrink])  # (7, 3, 3)
+    distances = sampson_distance(rows, changed)  # (7, N)
+    near = distances[0] < threshold
+    distances = distances[:, near]
+    distance = distances[0]
+    if len(distance) < MIN_INLIERS:
+        return None
+    jacobian = (distances[1:] - distance) / _DIFFERENCE
+    hessian, gradient = jacobian @ jacobian.T, jacobian @ distance
     step = np.linalg.lstsq(hessian, gradient, rcond=None)[0]
     pose_step = np.linalg.lstsq(hessian[:5, :5], gradient[:5], rcond=None)[0]
-    return float(gradient @ step - gradient[:5] @ pose_step), -1.0 if step[5] > 0 else 1.0
+    gain = float(gradient @ step - gradient[:5] @ pose_step)
+    variance = float(np.mean(distance**2))
+    cost = len(distance) * variance + np.count_nonzero(~near) * threshold**2
+    worth = gain / max(MIN_PROMISED_SHARE * cost, MIN_PROMISED_VARIANCES * variance, 1e-300)
+    return _Promise(worth, -1.0 if step[5] > 0 else 1.0, variance)
 
 
 def _descend(rows: Array, trial: _Trial, step: float, threshold: float) -> _Trial:

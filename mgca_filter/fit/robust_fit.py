@@ -7,7 +7,7 @@ inliers hold it firmly. Otherwise unlike sources propose; where the first of the
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import acos, degrees
 
 import numpy as np
@@ -35,8 +35,9 @@ REFINE_PX = 1.0
 SAME_DEG, TWIN_DEG = 0.3, 2.0
 # The early end is given up where a run explains less than the first share of the list; above the second, one will do.
 PROMISING, CERTAIN = 0.3, 0.7
-# A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
-TWIN_SHARE = 0.5
+# A twin that explains less than this share of what the best pose does within so many pixels, before it is refined, is
+# no alternative.
+TWIN_SHARE, TWIN_PX = 0.5, 2.0
 
 # What needs no network; then what uses it; then what is still tried where those do not settle it.
 BEFORE_NETWORK = (
@@ -98,6 +99,7 @@ class TwoViewModel:
         ended: ``"before the network"``, ``"first sources"`` or ``"all sources"``.
         confidence: probability that the pose is within 10 degrees; None with guessed intrinsics.
         judgement: the measurements behind the choice; None likewise.
+        plane: homography (3, 3) of the dominant plane among its inliers, where it was looked for; else None.
     """
 
     M: Array
@@ -108,6 +110,7 @@ class TwoViewModel:
     ended: str
     confidence: float | None = None
     judgement: Judgement | None = None
+    plane: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -136,6 +139,7 @@ class Search:
         self._coefficients, self._options, self._plan = coefficients, options, plan
         self._poses: list[_Pose] = []
         self._twins_of: _Pose | None = None
+        self._plane: Array | None = None
         self._judgement: Judgement | None = None
         self._take(evidence)
 
@@ -153,7 +157,10 @@ class Search:
         self._propose_twins()
         model = self.current("before the network")
         judgement = None if model is None else model.judgement
-        return model if judgement is not None and choice.explains_list(judgement, self._coefficients) else None
+        if model is None or judgement is None or not choice.explains_list(judgement, self._coefficients):
+            return None
+        same = self._twins_of is not None and _angle_deg(self._twins_of, self._best()) < TWIN_DEG
+        return replace(model, plane=self._plane) if same else model
 
     def with_network(self, evidence: Evidence) -> TwoViewModel | None:
         """The model by all sources, on scored matches; None where nothing is found."""
@@ -210,17 +217,17 @@ class Search:
         """Under a dominant plane every pose has a twin that explains it as well: let both be judged."""
         if not self._plan.twins:
             return
-        best = self._poses[self._judge().chosen]
+        best = self._best()
         if self._twins_of is not None and _angle_deg(self._twins_of, best) < TWIN_DEG:
             return
         self._twins_of = best
-        for E in sources.plane(self._evidence, best.R, best.t, self._options.seed):
-            pose = pose_from_essential(E, self._fitted, self._evidence.focal_px)
-            if pose is not None:
-                twin = _Pose(*pose, Family.PLANE, "plane")
-                new = all(_angle_deg(twin, other) > TWIN_DEG for other in self._poses)
-                if new and self._near(twin) > TWIN_SHARE * self._near(best):
-                    self._add(twin)
+        self._plane = sources.dominant_plane(self._evidence, best.R, best.t, self._options.seed)
+        found = [pose_from_essential(E, self._fitted, self._evidence.focal_px) for E in sources.plane(self._plane)]
+        twins = [_Pose(*pose, Family.PLANE, "plane") for pose in found if pose is not None]
+        near = self._near([best, *twins], self._fitted, TWIN_PX)
+        for twin, count in zip(twins, near[1:]):
+            if count > TWIN_SHARE * near[0] and all(_angle_deg(twin, other) > TWIN_DEG for other in self._poses):
+                self._add(twin)
 
     def _add(self, found: _Pose) -> None:
         """Refine what was found; what was found before is there refined."""
@@ -233,14 +240,23 @@ class Search:
         self._poses.append(_Pose(R, t, found.family, found.origin))
         self._judgement = None
 
-    def _near(self, pose: _Pose) -> int:
-        """Number of matches within two pixels of a pose and in front of it."""
-        residuals = choice.measure_residuals(self._fitted, pose.R[None], pose.t[None], self._evidence.focal_px)
-        return int(np.count_nonzero((residuals.distance_px < 2.0) & ~residuals.behind))
+    def _near(self, poses: Sequence[_Pose], matches: Array, reach_px: float) -> list[int]:
+        """Numbers of matches (N, 4) within a distance of each pose and in front of it."""
+        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+        residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px)
+        near = (residuals.distance_px < reach_px) & ~residuals.behind
+        return [int(count) for count in near.sum(axis=1)]
+
+    def _best(self) -> _Pose:
+        """The best of what was found so far."""
+        return self._poses[0 if len(self._poses) == 1 else self._judge().chosen]
 
     def _explained(self) -> float:
         """Share of the matches that the best of what was found explains."""
-        return float(np.exp(self._judge().features["log share"])) if self._poses else 0.0
+        if not self._poses:
+            return 0.0
+        inliers = self._near([self._best()], self._judged, choice.INLIER_PX)[0]
+        return choice.explained_share(inliers, len(self._judged))
 
     def _settled(self) -> bool:
         """True where nothing more needs to be tried: unlike sources agree, or hope is lost.
@@ -349,7 +365,7 @@ def pose_from_essential(E: Array, correspondences: Array, focal_px: float) -> tu
         return None
     poses = decompose_essential(project_to_essential(E))
     R, t = np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
-    behind = choice.measure_residuals(near, R, t, focal_px).behind
+    behind = choice.lie_behind(near, R, t, focal_px)
     return poses[int(np.argmin(behind.sum(axis=1)))]
 
 

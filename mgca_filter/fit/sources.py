@@ -84,16 +84,20 @@ def above(margin: float) -> Source:
     return source
 
 
-def plane(evidence: Evidence, R: Array, t: Array, seed: int) -> list[Array]:
-    """Essential matrices that the dominant plane among the inliers of a pose allows: its own and its twin.
+def dominant_plane(evidence: Evidence, R: Array, t: Array, seed: int) -> Array | None:
+    """Homography (3, 3) of the dominant plane among the inliers of a pose, on the normalised image planes."""
+    threshold = 1.0 / evidence.focal_px
+    rows = evidence.correspondences[evidence.accepted()]
+    near = rows[sampson_distance(rows, essential_from_pose(R, t)) < threshold]
+    return fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, seed)
+
+
+def plane(H: Array | None) -> list[Array]:
+    """Essential matrices that the homography of a plane allows: of the pose that led to it, and its twin.
 
     Where most matches lie on one plane two poses explain them about equally well, and sampling, which asks for no
     depths, meets one of them by chance.
     """
-    threshold = 1.0 / evidence.focal_px
-    rows = evidence.correspondences[evidence.accepted()]
-    near = rows[sampson_distance(rows, essential_from_pose(R, t)) < threshold]
-    H = fit_homography(near[:, :2], near[:, 2:], HOMOGRAPHY_THRESHOLD_FACTOR * threshold, seed)
     # Of the four poses two and two differ in the sign of t alone, which E does not know.
     return [] if H is None else [essential_from_pose(*pose) for pose in poses_from_homography(H)[::2]]
 

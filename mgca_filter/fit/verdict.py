@@ -69,7 +69,7 @@ def judge(
         options: confidence and seed of the robust fits that the tests of degeneracy need.
     """
     nothing = np.zeros(len(pair.valid), dtype=bool)
-    if count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+    if len(evidence) < MIN_MATCHES and count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
         return Verdict(Status.TOO_FEW_MATCHES, nothing)
     if model is None:
         return Verdict(Status.NO_GEOMETRY, nothing)
@@ -85,7 +85,8 @@ def judge(
         return _plane_or(Verdict(Status.NO_GEOMETRY, nothing), pair, evidence, mask_threshold_px, options)
     support = degeneracy.measure_support(fitted, model.M, threshold)
     for part in (inliers[:, :2], inliers[:, 2:]):
-        if degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
+        on_line = degeneracy.may_lie_on_line(part, threshold, support)
+        if on_line and degeneracy.explains(degeneracy.line_distance(part, threshold), threshold, support):
             return Verdict(Status.NO_GEOMETRY, nothing)
     info: dict[str, Any] = {"support": support.count, "log10_false_alarms": support.log10_nfa}
     weak = support.count < degeneracy.MIN_SUPPORT or support.log10_nfa > degeneracy.LOW_SUPPORT_LOG10_NFA
@@ -111,7 +112,7 @@ def judge(
     factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
     if factor is not None:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
-    return _test_plane(pair, evidence, inlier_rows, support, options, verdict)
+    return _test_plane(pair, model, evidence, inlier_rows, support, options, verdict)
 
 
 def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: float, options: FilterOptions) -> Verdict:
@@ -205,6 +206,10 @@ def _test_rotation(
         fitted_rows: (N,) rows of the pair's matches that bear witness.
         near: (N,) bool, those of them that agree with the model.
     """
+    zooms = np.stack([camera.K[:2, :2] for camera in (pair.intrinsics1, pair.intrinsics2)])
+    shortest_px = float(np.linalg.svd(zooms, compute_uv=False).min())
+    if not degeneracy.may_only_turn(pair.correspondences[fitted_rows], REFINE_PX / shortest_px, support):
+        return None
     R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
     H = pair.intrinsics2.K @ R @ np.linalg.inv(pair.intrinsics1.K)
     distance_px = homography_distance(*pair.pixels(fitted_rows), H)
@@ -219,6 +224,7 @@ def _test_rotation(
 
 def _test_plane(
     pair: PairInput,
+    model: TwoViewModel,
     evidence: Evidence,
     inlier_rows: NDArray[np.intp],
     support: degeneracy.Support,
@@ -227,6 +233,10 @@ def _test_plane(
 ) -> Verdict:
     """The verdict with the homography that explains the inliers as well, where there is one."""
     points1, points2 = pair.pixels(inlier_rows)
+    if model.plane is not None:
+        found = pair.intrinsics2.K @ model.plane @ np.linalg.inv(pair.intrinsics1.K)
+        if not degeneracy.may_explain(homography_distance(points1, points2, found), REFINE_PX, support):
+            return verdict
     quick = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * REFINE_PX, options.seed)
     if quick is None or not degeneracy.explains(homography_distance(points1, points2, quick), REFINE_PX, support):
         return verdict

@@ -64,6 +64,8 @@ class Intrinsics:
 
     def normalize(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Pixels (N, 2) to the normalised image plane (N, 2), distortion removed; NaN where that fails."""
+        if self.distortion is None and np.isfinite(points).all():
+            return normalize_points(points, self.K)
         normalized = np.full(points.shape, np.nan)
         finite = np.isfinite(points).all(axis=1)
         if self.distortion is None:
@@ -140,8 +142,10 @@ def lens_doubt(camera: Intrinsics, points: NDArray[np.float64], image: int) -> s
     """One sentence where the lens of a camera can hardly be meant so, or None: it shows nothing at many of the
     keypoints (N, 2) of its image, or four coefficients, legal for OpenCV's pinhole and fisheye model alike, are read as
     a pinhole's that sees further to the side than such lenses do."""
+    if camera.distortion is None:
+        return None
     finite = points[np.isfinite(points).all(axis=1)]
-    if camera.distortion is None or len(finite) == 0:
+    if len(finite) == 0:
         return None
     plain = not isinstance(camera.distortion, Fisheye) and len(camera.distortion) == 4
     advice = "if they are a fisheye's, pass Fisheye(k1, k2, k3, k4)"

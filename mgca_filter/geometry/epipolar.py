@@ -37,28 +37,36 @@ def homogeneous(points: ArrayLike) -> FloatArray:
     return np.concatenate([p, np.ones((len(p), 1))], axis=1)
 
 
+def homogeneous_columns(points: ArrayLike) -> FloatArray:
+    """Points (N, 2) as columns (3, N) with a row of ones: products with matrices from the left are fastest so."""
+    p = np.asarray(points, dtype=np.float64)
+    columns = np.ones((3, len(p)))
+    columns[:2] = p.T
+    return columns
+
+
 def _epipolar_terms(
     correspondences: ArrayLike, E: ArrayLike, stretch1: FloatArray | None = None, stretch2: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Algebraic error (N,) and the squared norms (N,) of its derivatives by the points of image 2 and 1.
+    """Algebraic error (..., N) and the squared norms (..., N) of its derivatives by the points of image 2 and 1.
 
     These are the normals of the epipolar lines, or, through the lenses, the derivatives by what was seen.
     """
     c = np.asarray(correspondences, dtype=np.float64)
-    x1, x2 = homogeneous(c[:, :2]), homogeneous(c[:, 2:4])
     E = np.asarray(E, dtype=np.float64)
-    line2, line1 = x1 @ E.T, x2 @ E
-    normal2, normal1 = line2[:, :2], line1[:, :2]
+    x1, x2 = homogeneous_columns(c[:, :2]), homogeneous_columns(c[:, 2:4])
+    line2 = E @ x1  # (..., 3, N)
+    normal2, normal1 = line2[..., :2, :], np.swapaxes(E, -1, -2)[..., :2, :] @ x2
     if stretch1 is not None:
-        normal1 = np.einsum("ni,nij->nj", normal1, stretch1)
+        normal1 = np.einsum("...in,nij->...jn", normal1, stretch1)
     if stretch2 is not None:
-        normal2 = np.einsum("ni,nij->nj", normal2, stretch2)
-    return _row_products(x2, line2), _row_products(normal2, normal2), _row_products(normal1, normal1)
+        normal2 = np.einsum("...in,nij->...jn", normal2, stretch2)
+    return _column_products(x2, line2), _column_products(normal2, normal2), _column_products(normal1, normal1)
 
 
-def _row_products(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Scalar products (N,) of rows: ``np.sum`` over so short an axis takes several times as long."""
-    return np.asarray(np.einsum("ni,ni->n", a, b), dtype=np.float64)
+def _column_products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Scalar products (..., N) of columns (..., K, N)."""
+    return np.asarray(np.einsum("...in,...in->...n", a, b), dtype=np.float64)
 
 
 def symmetric_epipolar_distance_squared(correspondences: ArrayLike, E: ArrayLike) -> FloatArray:
@@ -75,13 +83,13 @@ def symmetric_epipolar_distance_squared(correspondences: ArrayLike, E: ArrayLike
 def sampson_distance(
     correspondences: ArrayLike, E: ArrayLike, stretch1: FloatArray | None = None, stretch2: FloatArray | None = None
 ) -> FloatArray:
-    """First-order distance (N,) to the epipolar geometry, in the unit of the coordinates.
+    """First-order distance (..., N) to the epipolar geometry, in the unit of the coordinates.
 
     |x2^T E x1| / sqrt(|E x1|^2_12 + |E^T x2|^2_12) (Hartley & Zisserman, 2nd ed., eq. 11.9).
     Works for F and pixels as well.
 
     Args:
-        correspondences: (N, 4). E: (3, 3).
+        correspondences: (N, 4). E: (..., 3, 3).
         stretch1, stretch2: (N, 2, 2), derivatives of the points by where the lens showed them, or None = none: the
             distance is then that in the distorted images.
     """
@@ -114,10 +122,10 @@ def triangulated_depths(correspondences: ArrayLike, R: ArrayLike, t: ArrayLike) 
     """
     c = np.asarray(correspondences, dtype=np.float64)
     t = np.asarray(t, dtype=np.float64).ravel()
-    a = homogeneous(c[:, :2]) @ np.asarray(R, dtype=np.float64).T
-    b = homogeneous(c[:, 2:4])
-    aa, bb, ab = _row_products(a, a), _row_products(b, b), _row_products(a, b)
-    at, bt = a @ t, b @ t
+    a = np.asarray(R, dtype=np.float64) @ homogeneous_columns(c[:, :2])
+    b = homogeneous_columns(c[:, 2:4])
+    aa, bb, ab = _column_products(a, a), _column_products(b, b), _column_products(a, b)
+    at, bt = t @ a, t @ b
     det = aa * bb - ab**2
     with np.errstate(divide="ignore", invalid="ignore"):
         depth1 = (ab * bt - bb * at) / det

@@ -6,10 +6,13 @@ translation on its tangent plane (PoseLib and Hartley & Zisserman, 2nd ed., sec.
 
 from __future__ import annotations
 
+from math import hypot, sqrt
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import cross_matrix
+from .epipolar import cross_matrix, homogeneous_columns
 
 Array = NDArray[np.float64]
 
@@ -21,6 +24,8 @@ _CONVERGED_DECREASE = 1e-4
 MIN_INLIERS = 6
 # Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
 _LINEAR_DEG, _RINGS, _SPOKES, _SPREAD_ROWS = 0.1, 28, 12, 200
+# What small turns about the axes make of a vector: its products with them.
+_TURNS = np.stack([cross_matrix(axis) for axis in np.eye(3)])  # (3, 3, 3)
 # Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 REACH = 12.0
 
@@ -38,24 +43,27 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
     Returns:
         The refined R, t; its truncated cost is never above the one it started from.
     """
-    reached = np.abs(SampsonTerms(correspondences, R, t).residual()) < REACH * threshold
+    x1, x2 = _columns(correspondences)
+    now = SampsonTerms(x1, x2, R, t)
+    reached = np.abs(now.residual) < REACH * threshold
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
-    correspondences = correspondences[reached]
-    now = SampsonTerms(correspondences, R, t)
-    cost, near = _truncated(now.residual(), threshold)
+    if not reached.all():
+        x1, x2 = x1[:, reached], x2[:, reached]
+        now = SampsonTerms(x1, x2, R, t)
+    cost, near = _truncated(now.residual, threshold)
     damping = _INITIAL_DAMPING
     for _ in range(rounds):
         if np.count_nonzero(near) < MIN_INLIERS:
             break
-        residual, J = now.linearise(near)
-        hessian, gradient = J.T @ J, J.T @ residual
+        J = now.derivatives() * near
+        hessian, gradient = J @ J.T, J @ now.residual
+        diagonal = np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
         previous = cost
         while damping < _MAX_DAMPING:
-            damped = hessian + damping * np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
-            step = -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
-            new = SampsonTerms(correspondences, *_apply_step(now.R, now.t, step))
-            new_cost, new_near = _truncated(new.residual(), threshold)
+            step = -np.asarray(np.linalg.solve(hessian + damping * diagonal, gradient), dtype=np.float64)
+            new = SampsonTerms(x1, x2, *apply_step(now.R, now.t, step))
+            new_cost, new_near = _truncated(new.residual, threshold)
             if new_cost < cost:
                 now, cost, near = new, new_cost, new_near
                 damping *= 0.1
@@ -68,7 +76,7 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
 
 def truncated_cost(correspondences: Array, R: Array, t: Array, threshold: float) -> float:
     """Sum of squared Sampson distances, each cut off at ``threshold``: what MSAC minimises."""
-    return _truncated(SampsonTerms(correspondences, R, t).residual(), threshold)[0]
+    return _truncated(SampsonTerms(*_columns(correspondences), R, t).residual, threshold)[0]
 
 
 def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> float:
@@ -83,9 +91,8 @@ def pose_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) -> fl
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    terms = SampsonTerms(inliers, R, t)
-    _, J = terms.linearise(np.ones(len(inliers), dtype=bool))
-    curvature = float(np.linalg.eigvalsh(J.T @ J)[0])
+    J = SampsonTerms(*_columns(inliers), R, t).derivatives()
+    curvature = float(np.linalg.eigvalsh(J @ J.T)[0])
     return float(np.clip(np.degrees(noise / np.sqrt(max(curvature, 1e-18))), 1e-3, 90.0))
 
 
@@ -100,8 +107,8 @@ def direction_uncertainty_deg(inliers: Array, R: Array, t: Array, noise: float) 
     """
     if len(inliers) < MIN_INLIERS:
         return 90.0
-    _, J = SampsonTerms(inliers, R, t).linearise(np.ones(len(inliers), dtype=bool))
-    information = J.T @ J
+    J = SampsonTerms(*_columns(inliers), R, t).derivatives()
+    information = J @ J.T
     rotation, cross, direction = information[:3, :3], information[:3, 3:], information[3:, 3:]
     damping = _SMALLEST_CURVATURE * np.eye(3)
     marginal = direction - cross.T @ np.linalg.solve(rotation + damping, cross)
@@ -121,7 +128,8 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     ring, spoke = np.repeat(np.arange(_RINGS), _SPOKES), np.tile(np.arange(_SPOKES), _RINGS)
     offsets = across[spoke] @ _tangent_basis(t)
     directions = np.cos(angle[ring])[:, None] * t + np.sin(angle[ring])[:, None] * offsets  # (D, 3)
-    costs = step * (_costs_of_directions(rows, R, directions) - _costs_of_directions(rows, R, t[None]))
+    costs = costs_of_directions(rows, R, np.vstack([t, directions]))
+    costs = step * (costs[1:] - costs[0])
     log_weights = -0.5 * costs / noise**2 + np.log(np.sin(angle[ring]) * width[ring])
     weights = np.exp(log_weights - log_weights.max())
     moved = angle[ring][:, None] * across[spoke]
@@ -129,57 +137,69 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     return float(min(np.degrees(np.sqrt(np.linalg.eigvalsh(moments)[1])), 90.0))
 
 
-def _costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
+def costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
     """Summed squared Sampson distances (D,) of matches (N, 4) to poses with directions (D, 3), the rotation moved from
-    R as each likes best, to first order."""
-    x1, x2 = (np.column_stack([part, np.ones(len(rows))]) for part in (rows[:, :2], rows[:, 2:]))
-    rays = x1 @ R.T  # (N, 3), in the second camera
-    normals = np.cross(x2[None], directions[:, None])  # (D, N, 3)
-    lines2, lines1 = np.cross(directions[:, None], rays[None]), normals @ R
-    squared_norm = np.sum(lines2[..., :2] ** 2, axis=2) + np.sum(lines1[..., :2] ** 2, axis=2)
-    scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))  # (D, N)
-    residual = np.einsum("nk,dnk->dn", rays, normals) * scale
-    J = np.cross(rays[None], normals) * scale[..., None]  # (D, N, 3)
-    gradient = np.einsum("dnk,dn->dk", J, residual)
-    hessian = np.einsum("dnj,dnk->djk", J, J) + _SMALLEST_CURVATURE * np.eye(3)
+    R as each likes best, to first order.
+
+    Of a direction d the error is d · (r × x2), its derivative by the rotation A d with A = x2 rᵀ - (r · x2) I, and the
+    squared norm of the line normals a quadratic form of d: all are sums of a few products of d with what the matches
+    tell, so that products of matrices give them for all directions and matches at once.
+    """
+    x1, x2 = homogeneous_columns(rows[:, :2]), homogeneous_columns(rows[:, 2:])
+    rays = R @ x1  # (3, N), in the second camera
+    # Line normals in image 2, then in image 1, of unit directions: rows 0 and 1 of d × r and of Rᵀ (x2 × d).
+    normals = np.concatenate([(_TURNS @ rays)[:, :2], R.T[:2] @ -(_TURNS @ x2)], axis=1)  # (3, 4, N)
+    forms = np.einsum("jkn,lkn->jln", normals, normals).reshape(9, -1)
+    squares = np.einsum("dj,dl->djl", directions, directions).reshape(-1, 9)  # (D, 9)
+    weight = 1.0 / np.maximum(squares @ forms, np.finfo(np.float64).tiny)  # (D, N)
+    error = directions @ _cross(rays, x2)
+    A = x2[:, None] * rays[None] - np.sum(rays * x2, axis=0) * np.eye(3)[..., None]  # (3, 3, N)
+    pairs = np.einsum("jln,kmn->jklmn", A, A).reshape(81, -1)
+    gradient = np.einsum("djl,dl->dj", ((weight * error) @ A.reshape(9, -1).T).reshape(-1, 3, 3), directions)
+    hessian = np.einsum("djkl,dl->djk", (weight @ pairs.T).reshape(-1, 3, 3, 9), squares)
+    hessian += _SMALLEST_CURVATURE * np.eye(3)
     gain = np.einsum("dk,dk->d", gradient, np.linalg.solve(hessian, gradient[..., None])[..., 0])
-    return np.asarray(np.sum(residual**2, axis=1) - gain, dtype=np.float64)
+    return np.asarray(np.einsum("dn,dn->d", weight * error, error) - gain, dtype=np.float64)
 
 
 class SampsonTerms:
-    """Sampson distances of matches (N, 4) to a pose, and how they change with it; column by column, which is fastest.
+    """Sampson distances of matches to a pose, and how they change with it.
+
+    Args:
+        x1, x2: (3, N) on the normalised image planes, with a row of ones.
+        R, t: the pose.
 
     Attributes:
-        R, t: the pose.
+        R, t: as given.
+        residual: (N,) signed Sampson distances, normalised.
     """
 
-    def __init__(self, correspondences: Array, R: Array, t: Array) -> None:
+    def __init__(self, x1: Array, x2: Array, R: Array, t: Array) -> None:
         self.R, self.t = R, t
-        x1, y1, x2, y2 = correspondences.T
-        self._x2, self._y2 = x2, y2
-        r0, r1, r2 = self._rays = [R[i, 0] * x1 + R[i, 1] * y1 + R[i, 2] for i in range(3)]  # in the second camera
-        t0, t1, t2 = t
-        n0, n1, n2 = self._normals = [y2 * t2 - t1, t0 - x2 * t2, x2 * t1 - y2 * t0]  # x2 × t
-        self._error = r0 * n0 + r1 * n1 + r2 * n2  # x2ᵀ E x1
-        l0, l1 = t1 * r2 - t2 * r1, t2 * r0 - t0 * r2  # epipolar lines in image 2, then in image 1
-        m0, m1 = (n0 * R[0, i] + n1 * R[1, i] + n2 * R[2, i] for i in range(2))
-        squared_norm = l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1
+        self._x1, self._x2 = x1, x2
+        E = cross_matrix(t) @ R
+        line2 = E @ x1  # (3, N)
+        normals = np.concatenate([line2[:2], E.T[:2] @ x2])  # (4, N), of the lines in image 2, then in image 1
+        squared_norm = np.einsum("in,in->n", normals, normals)
         self._scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
+        self.residual = np.einsum("in,in->n", line2, x2) * self._scale
 
-    def residual(self) -> Array:
-        """Signed Sampson distances (N,), normalised."""
-        return np.asarray(self._error * self._scale)
+    def derivatives(self) -> Array:
+        """Derivatives (5, N) of the residuals by a rotation on the left of R and two steps of t, normals held fixed."""
+        T = cross_matrix(self.t)
+        across = (_tangent_basis(self.t) @ _TURNS.reshape(3, 9)).reshape(2, 3, 3)
+        of_E = np.concatenate([T @ _TURNS, across]) @ self.R  # (5, 3, 3)
+        return np.asarray(np.einsum("kin,in->kn", of_E @ self._x1, self._x2 * self._scale))
 
-    def linearise(self, used: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Residuals (K,) of the used matches and their derivatives (K, 5), line normals held fixed."""
-        scale = self._scale[used]
-        r0, r1, r2 = (part[used] * scale for part in self._rays)
-        n0, n1, n2 = (part[used] for part in self._normals)
-        x2, y2 = self._x2[used], self._y2[used]
-        J = np.empty((len(scale), 5))
-        J[:, 0], J[:, 1], J[:, 2] = r1 * n2 - r2 * n1, r2 * n0 - r0 * n2, r0 * n1 - r1 * n0
-        J[:, 3:] = np.stack([r1 - r2 * y2, r2 * x2 - r0, r0 * y2 - r1 * x2], axis=1) @ _tangent_basis(self.t).T
-        return self._error[used] * scale, J
+
+def _columns(correspondences: Array) -> tuple[Array, Array]:
+    """Points of both images (3, N), (3, N) of matches (N, 4)."""
+    return homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Vector products (3, N) of columns: ``np.cross`` takes several times as long."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _truncated(residual: Array, threshold: float) -> tuple[float, NDArray[np.bool_]]:
@@ -190,24 +210,21 @@ def _truncated(residual: Array, threshold: float) -> tuple[float, NDArray[np.boo
 
 def _tangent_basis(t: Array) -> Array:
     """Two unit vectors (2, 3) orthogonal to ``t``."""
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(t))] = 1.0
-    T = cross_matrix(t)
-    first = T @ axis
-    first /= np.linalg.norm(first)
-    return np.stack([first, T @ first])
+    x, y, z = t.tolist()
+    sizes = [abs(x), abs(y), abs(z)]
+    # Its product with the axis that it is farthest from, then with that. In plain floats: arrays of three are slow.
+    a, b, c = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[sizes.index(min(sizes))]
+    norm = hypot(a, b, c)
+    a, b, c = a / norm, b / norm, c / norm
+    return np.array([[a, b, c], [y * c - z * b, z * a - x * c, x * b - y * a]])
 
 
 def rotation_from_vector(vector: Array) -> Array:
     """Rotation (3, 3) about ``vector`` (3,) by its length in radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    if angle < 1e-12:
-        return np.eye(3) + cross_matrix(vector)
-    k = cross_matrix(vector / angle)
-    R: Array = np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
-    return R
+    return np.asarray(cv2.Rodrigues(vector)[0], dtype=np.float64)
 
 
-def _apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
-    t_new = t + step[3:] @ _tangent_basis(t)
-    return rotation_from_vector(step[:3]) @ R, t_new / np.linalg.norm(t_new)
+def apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
+    """The pose after a step (5,): a rotation vector on the left of R, then two moves across ``t``."""
+    moved = t + step[3:] @ _tangent_basis(t)
+    return rotation_from_vector(step[:3]) @ R, moved / sqrt(moved @ moved)

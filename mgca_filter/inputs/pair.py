@@ -196,7 +196,7 @@ def prepare_pair(pair: MatchPair) -> PairInput:
     present = (putative.index1 >= 0)[:, None]
     if present.any():
         ends = [
-            np.where(present, points[index], np.nan)
+            points.take(index, axis=0) if present.all() else np.where(present, points[index], np.nan)
             for points, index in (
                 (keypoints1.points, putative.index1),
                 (keypoints2.points, putative.index2),
@@ -274,8 +274,8 @@ def _check_shared_camera(pair: MatchPair) -> None:
 
 def _extent(points: NDArray[np.float64]) -> float:
     """The longer side of the box around the finite points."""
-    finite = points[np.isfinite(points).all(axis=1)]
-    return float(np.ptp(finite, axis=0).max()) if len(finite) else 0.0
+    finite = points if np.isfinite(points).all() else points[np.isfinite(points).all(axis=1)]
+    return max(float(np.ptp(column)) for column in finite.T) if len(finite) else 0.0
 
 
 def _pixels_per_unit(intrinsics1: Intrinsics, intrinsics2: Intrinsics, extent: float) -> tuple[float, float]:

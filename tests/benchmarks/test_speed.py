@@ -41,6 +41,16 @@ def test_ratios_by_hand() -> None:
     assert cells == [CLEAR, "3", "300", "90 %", "30.0", "15.0", "10.0", "3.00", "1.50", "2.00", "2", "1.00"]
 
 
+def test_clear_lists_by_length_by_hand() -> None:
+    early = [ListTime("clean", 300, 0.9, *ms) for ms in ((10.0, 0.0, 10.0), (40.0, 0.0, 10.0))]
+    others = [ListTime("clean", 349, 0.9, 40.0, 15.0, 10.0), ListTime("clean", 1500, 0.9, 30.0, 0.0, 10.0)]
+    lines = speed.length_table([*early, *others, ListTime("clean", 100, 0.9, 30.0, 0.0, 10.0)]).splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+    assert rows[0] == ["200 to 349", "3", "2", "25.0", "10.0", "2.50", "2.50"]
+    assert rows[1] == ["1250 to 1500", "1", "1", "30.0", "10.0", "3.00", "3.00"]
+    assert len(rows) == 2
+
+
 def test_every_kind_of_list_of_every_pair_is_timed(tmp_path: Path, model_file: Path) -> None:
     pytest.importorskip("poselib")
     scenes = [make_scene(), make_scene(right=5, wrong=2, seed=1)]
@@ -67,9 +77,10 @@ def test_command_prints_ratios_for_bundles_alone(
         printed = capsys.readouterr().out
         assert "USAC_MAGSAC" in printed
         assert "Cold start" not in printed
-        rows = [line.split("|") for line in printed.splitlines() if line.startswith("|")][2:]
+        rows = [line.split("|") for line in printed.split("Of the ")[0].splitlines() if line.startswith("|")][2:]
         return sum(int(row[2]) for row in rows)
 
     assert number_of_lists() == 20
     assert number_of_lists("--per-scene", "1") == 10
     assert number_of_lists("--detectors", "orb2k") == 10
+    assert number_of_lists("--kinds", "cross", "raw") == 8

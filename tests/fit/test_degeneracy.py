@@ -7,10 +7,22 @@ import pytest
 from conftest import SIZE, K, Scene, make_scene
 
 from mgca_filter import FilterResult, MatchFilter, Status
-from mgca_filter.fit.degeneracy import chance_rate, fit_rotation, line_distance, log10_false_alarms, measure_support
+from mgca_filter.fit.degeneracy import (
+    Support,
+    chance_rate,
+    explains,
+    fit_rotation,
+    line_distance,
+    log10_false_alarms,
+    may_explain,
+    may_lie_on_line,
+    may_only_turn,
+    measure_support,
+)
 from mgca_filter.fit.focal_check import FOCAL_STEP, better_focal_factor
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg, translation_error_deg
+from mgca_filter.geometry.homography import homography_distance
 from mgca_filter.geometry.pose_refinement import refine_pose
 
 
@@ -136,6 +148,43 @@ def test_line_and_rotation_fits_set_outliers_aside() -> None:
     scene = make_scene("rotation", right=100, wrong=10, noise_px=0.0)
     rows = np.hstack([(p - K[:2, 2]) / K[0, 0] for p in (scene.points1, scene.points2)])
     assert rotation_error_deg(fit_rotation(rows, 1 / K[0, 0]), scene.R) < 1e-3
+
+
+@pytest.mark.parametrize("wrong", [0, 6, 40, 150])
+@pytest.mark.parametrize("seed", range(5))
+def test_no_line_and_no_rotation_that_explains_is_ruled_out_beforehand(seed: int, wrong: int) -> None:
+    rng = np.random.default_rng(seed)
+    along = np.column_stack([rng.uniform(0, 10, 80), rng.normal(0, 0.03, 80)])
+    points = rng.permutation(np.vstack([along, rng.uniform(0, 10, (wrong, 2))]))
+    scene = make_scene("rotation", right=100, wrong=wrong, noise_px=0.4, seed=seed)
+    rows = rng.permutation(np.hstack([normalize_points(p, K) for p in (scene.points1, scene.points2)]))
+    R = fit_rotation(rows, 1 / K[0, 0])
+    distance_px = homography_distance(*(rows[:, i : i + 2] * K[0, 0] for i in (0, 2)), homography_in_focals(R))
+    lines, turns = [], []
+    for chance_count in (0.0, 10.0, 50.0):
+        support = Support(80 + wrong, -9.0, chance_count)
+        lines.append((explains(line_distance(points, 0.05), 0.05, support), may_lie_on_line(points, 0.05, support)))
+        support = Support(100 + wrong, -9.0, chance_count)
+        turns.append((explains(distance_px, 1.0, support), may_only_turn(rows, 1 / K[0, 0], support)))
+    assert all(possible >= found for found, possible in [*lines, *turns])
+    assert all(found for found, _ in [*lines, *turns]) == (wrong == 0)
+
+
+def homography_in_focals(R: np.ndarray) -> np.ndarray:
+    """A rotation as a homography of points on the image planes times the focal length."""
+    zoom = np.diag([K[0, 0], K[0, 0], 1.0])
+    return zoom @ R @ np.linalg.inv(zoom)
+
+
+def test_a_general_scene_is_neither_line_nor_rotation_before_either_is_fitted() -> None:
+    scene = make_scene(right=200, wrong=10)
+    rows = np.hstack([normalize_points(p, K) for p in (scene.points1, scene.points2)])
+    support = Support(200, -9.0, 5.0)
+    assert not may_lie_on_line(rows[:, :2], 1 / K[0, 0], support)
+    assert not may_only_turn(rows, 1 / K[0, 0], support)
+    few = np.where(np.arange(210) < 100, 0.5, 50.0)
+    assert not may_explain(few, 1.0, support)
+    assert may_explain(np.where(np.arange(210) < 170, 0.5, 50.0), 1.0, support)
 
 
 @pytest.mark.parametrize("seed", range(3))

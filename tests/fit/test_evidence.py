@@ -16,6 +16,7 @@ from mgca_filter.fit.evidence import (
     MIN_MATCHES,
     RAW_MAX_RATIO,
     distinct_rows,
+    first_of_each,
     gather_scored,
     listed_rows,
     match_order,
@@ -32,6 +33,7 @@ def test_distinct_rows_are_those_of_numpy(values: list[tuple[float, ...]]) -> No
     expected, first = np.unique(rows, axis=0, return_index=True)
     np.testing.assert_array_equal(distinct_rows(rows), first)
     np.testing.assert_array_equal(rows[distinct_rows(rows)], expected)
+    np.testing.assert_array_equal(first_of_each(rows), np.sort(first))
 
 
 @given(GRID)

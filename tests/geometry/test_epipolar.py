@@ -41,6 +41,14 @@ def test_swapping_the_images_transposes_E(pose: tuple[np.ndarray, np.ndarray]) -
     )
 
 
+def test_a_stack_of_matrices_is_measured_as_each_of_them() -> None:
+    rng = np.random.default_rng(0)
+    points, E, stretch = rng.uniform(-1, 1, (20, 4)), rng.normal(size=(3, 3, 3)), rng.normal(size=(20, 2, 2))
+    for stretches in ((), (stretch, stretch[::-1])):
+        each = [epipolar.sampson_distance(points, one, *stretches) for one in E]
+        np.testing.assert_allclose(epipolar.sampson_distance(points, E, *stretches), each, rtol=1e-12)
+
+
 @given(poses)
 def test_decomposition_contains_the_pose(pose: tuple[np.ndarray, np.ndarray]) -> None:
     R, t = rotation_from_vector(pose[0]), pose[1]

@@ -7,8 +7,11 @@ import pytest
 from conftest import make_scene
 from fit_inputs import FOCAL, normalized
 
-from mgca_filter.geometry.epipolar import pose_error_deg, translation_error_deg
+from mgca_filter.geometry.epipolar import homogeneous_columns, pose_error_deg, translation_error_deg
 from mgca_filter.geometry.pose_refinement import (
+    SampsonTerms,
+    apply_step,
+    costs_of_directions,
     direction_uncertainty_deg,
     pose_uncertainty_deg,
     refine_pose,
@@ -32,6 +35,39 @@ def test_refinement_stays_at_the_exact_pose() -> None:
     exact = make_scene(wrong=0, noise_px=0.0)
     refined = refine_pose(normalized(exact), exact.R, exact.t, 1.0 / FOCAL)
     assert pose_error_deg(*refined, exact.R, exact.t) < 1e-5
+
+
+def terms(rows: np.ndarray, R: np.ndarray, t: np.ndarray) -> SampsonTerms:
+    return SampsonTerms(homogeneous_columns(rows[:, :2]), homogeneous_columns(rows[:, 2:]), R, t)
+
+
+def test_derivatives_are_those_of_the_residuals_at_exact_points() -> None:
+    # There the residual is zero, and so is what the line normals, held fixed, would add.
+    exact = make_scene(wrong=0, noise_px=0.0)
+    rows, step = normalized(exact), 1e-6
+    J = terms(rows, exact.R, exact.t).derivatives()
+    for axis in range(3):
+        moved = terms(rows, rotation_from_vector(step * np.eye(3)[axis]) @ exact.R, exact.t)
+        np.testing.assert_allclose(moved.residual / step, J[axis], atol=1e-4)
+    for axis in (3, 4):
+        unit = np.eye(5)[axis]
+        np.testing.assert_allclose(
+            terms(rows, *apply_step(exact.R, exact.t, step * unit)).residual / step, J[axis], atol=1e-4
+        )
+
+
+def test_costs_of_directions_are_those_of_poses_turned_as_each_likes_best() -> None:
+    scene = make_scene(wrong=0)
+    rows = normalized(scene)
+    directions = np.vstack([scene.t, np.random.default_rng(0).normal(size=(5, 3))])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    expected = []
+    for t in directions:
+        one = terms(rows, scene.R, t)
+        J = one.derivatives()[:3]
+        gain = (J @ one.residual) @ np.linalg.solve(J @ J.T, J @ one.residual)
+        expected.append(one.residual @ one.residual - gain)
+    np.testing.assert_allclose(costs_of_directions(rows, scene.R, directions), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("measure", [pose_uncertainty_deg, direction_uncertainty_deg])
