@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from mgca_filter import MatchFilter
 from mgca_filter.data.source import detect, read_image
-from mgca_filter.export.no_overlap import PairApart, Rectangle, crop, lists_of, parts_of_photographs, rendered_apart
+from mgca_filter.export.pairs_apart import PairApart, Rectangle, crop, lists_of, parts_of_photographs, rendered_apart
 from mgca_filter.features import create_detector, match_features
 from mgca_filter.geometry.epipolar import essential_from_pose, homogeneous, sampson_distance
 from mgca_filter.result import FilterResult, Status
@@ -47,7 +47,9 @@ _CUTS = (0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65)
 _MARGIN = 0.03
 # Farther from the axis than the image's corner by this factor the polynomial of a lens means nothing.
 _BEYOND_CORNER = 1.5
-_COLUMNS, _ROWS, _DEPTHS = 25, 17, 25
+# What an image shows is sampled at so many pixels, and at depths that lie no farther apart in the other than the
+# margin.
+_COLUMNS, _ROWS, _DEPTHS = 25, 17, (25, 200)
 
 
 class Depths(NamedTuple):
@@ -124,20 +126,28 @@ def _project(X: Array, photograph: Photograph) -> tuple[Array, Array]:
     return x @ np.diag(np.diag(camera.K)[:2]) + camera.K[:2, 2], depth
 
 
-def _shown(photograph: Photograph, rectangle: Rectangle, depths: Depths) -> Array:
-    """Points (N, 3) of the world all over what a part of a photograph may show."""
-    x0, y0, x1, y1 = rectangle
+def _shown(one: Photograph, part: Rectangle, depths: Depths, two: Photograph) -> Array | None:
+    """Points (N, 3) of the world all over what a part of a photograph may show; None where that takes too many."""
+    inverse = max(1.0 / depths.far, 1e-6 / depths.near), 1.0 / depths.near
+    baseline = np.linalg.norm(one.camera.R.T @ one.camera.t - two.camera.R.T @ two.camera.t)
+    parallax_px = 2.0 * baseline * (inverse[1] - inverse[0]) * two.camera.K[0, 0]
+    count = max(_DEPTHS[0], int(parallax_px / (_MARGIN * max(two.size))))
+    if count > _DEPTHS[1]:
+        return None
+    x0, y0, x1, y1 = part
     pixels = np.stack(np.meshgrid(np.linspace(x0, x1, _COLUMNS), np.linspace(y0, y1, _ROWS)), -1).reshape(-1, 2)
-    rays = homogeneous(_normalized(pixels, photograph.camera))
-    inverse = np.linspace(max(1.0 / depths.far, 1e-6 / depths.near), 1.0 / depths.near, _DEPTHS)
-    X = (rays / inverse[:, None, None]).reshape(-1, 3)
-    return np.asarray((X - photograph.camera.t) @ photograph.camera.R)
+    rays = homogeneous(_normalized(pixels, one.camera))
+    X = (rays / np.linspace(*inverse, count)[:, None, None]).reshape(-1, 3)
+    return np.asarray((X - one.camera.t) @ one.camera.R)
 
 
 def are_apart(one: Photograph, two: Photograph) -> bool:
-    """Whether no point within the depths of both photographs may be in both."""
+    """Whether it is certain that no point within the depths of both photographs is in both."""
     for here, there in ((one, two), (two, one)):
-        pixels, depth = _project(_shown(here, here.whole, here.depths), there)
+        shown = _shown(here, here.whole, here.depths, there)
+        if shown is None:
+            return False
+        pixels, depth = _project(shown, there)
         margin = _MARGIN * max(there.size)
         with np.errstate(invalid="ignore"):
             inside = ((pixels > -margin) & (pixels < np.array(there.size) + margin)).all(axis=1)
@@ -157,7 +167,10 @@ def parts_apart(one: Photograph, two: Photograph) -> tuple[Rectangle, Rectangle]
         for cut in _CUTS:
             for below in (True, False):
                 part = _side(one.size, axis, cut * one.size[axis], below)
-                pixels, _ = _project(_shown(one, part, Depths(one.depths.near, np.inf)), two)
+                shown = _shown(one, part, Depths(one.depths.near, np.inf), two)
+                if shown is None:
+                    return None
+                pixels, _ = _project(shown, two)
                 margin = _MARGIN * max(two.size)
                 with np.errstate(invalid="ignore"):
                     near = ((pixels > -margin) & (pixels < np.array(two.size) + margin)).all(axis=1)

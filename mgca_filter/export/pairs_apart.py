@@ -1,7 +1,7 @@
 """Two images of one place that show nothing in common: every pose that is found for them is wrong, certainly.
 
 Repeated windows, arches and columns make matches agree where no point of the scene is seen twice. The poses that come
-of them ruin maps (*doppelgangers*: Cai et al., ICCV 2023), and photographs of different places hold nothing of the kind.
+of them ruin maps (*doppelgangers*: Cai et al., ICCV 2023); photographs of different places hold nothing of the kind.
 """
 
 from __future__ import annotations
