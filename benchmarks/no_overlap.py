@@ -277,7 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = study_parser("no_overlap", __doc__, per_scene=False)
     parser.add_argument("--scenes", nargs="+", default=[], type=Path, metavar="SCENE", help="photographs with cameras")
     parser.add_argument("--photos", type=Path, metavar="FOLDER", help="to be cut in two, and to render worlds of")
-    parser.add_argument("--pairs", type=int, default=60, metavar="N", help="of each kind; of a scene (default 60)")
+    parser.add_argument("--pairs", type=int, default=60, metavar="N", help="of each kind (default 60)")
     parser.add_argument(
         "--settings",
         nargs="+",
@@ -298,7 +298,7 @@ def sources(options: argparse.Namespace) -> Iterator[tuple[str, Iterator[PairApa
     scenes = {folder.name: scene_photographs(folder, options.seed) for folder in options.scenes}
     kinds: dict[str, list[PairApart]] = {}
     for name, photographs in scenes.items():
-        for kind, pairs in scene_pairs(photographs, name, options.pairs, options.seed).items():
+        for kind, pairs in scene_pairs(photographs, name, -(-options.pairs // len(scenes)), options.seed).items():
             kinds.setdefault(kind, []).extend(pairs)
     yield from ((kind, iter(pairs)) for kind, pairs in kinds.items())
     if len(scenes) > 1:

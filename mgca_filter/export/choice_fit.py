@@ -48,6 +48,8 @@ KINDS = ("raw", "cross", "ratio", "cross and ratio")
 PLAIN_RATIO = 0.75
 # "ok" is said from the confidence on at which this share is right, and nothing below the second, which is chance's.
 OK_PRECISION, LEAST_CONFIDENCE = 0.96, 0.1
+# Of the pairs of one place without overlap this share may pass for "ok".
+APART_OK = 0.05
 # Of the poses that the bundles of a scene vouch for, so many of the easy ones agree with them (``QUALITY.csv``).
 LEAST_QUALITY = 0.92
 # What the lists of pairs without overlap are made with: as ``match_images`` does, and another kind of corners.
@@ -223,6 +225,16 @@ def describe_verdicts(p: Array, right: NDArray[np.bool_], least: float, usable: 
     )
 
 
+def describe_apart(p: Array, right: NDArray[np.bool_], apart: NDArray[np.bool_], usable: float) -> str:
+    """How many lists without overlap are "ok", and the limit of the confidence that would make it few, in a line."""
+    limit = max(float(np.quantile(p[apart], 1.0 - APART_OK)), usable)
+    return (
+        f"without overlap: {100.0 * (p[apart] >= usable).mean():.1f} % of {np.count_nonzero(apart)} lists are ok; "
+        f"at most {100.0 * APART_OK:.0f} % from {limit:.2f} on, with {100.0 * (p[right] >= limit).mean():.1f} % of the "
+        "right ones"
+    )
+
+
 def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Sample]:
     """Samples of all lists."""
     sound = next((s for s in map(sound_scenes, options.bundles) if s is not None), None)
@@ -338,6 +350,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not early:
                 coefficients["verdict"] = [LEAST_CONFIDENCE, usable_from(p, right)]
                 print(describe_verdicts(p, right, *coefficients["verdict"]))
+                apart = np.array([sample.group.startswith(APART) for sample in samples if not sample.early])
+                if apart.any():
+                    print(describe_apart(p, right, apart, coefficients["verdict"][1]))
         text = json.dumps(choice.check_coefficients(coefficients), indent=1)
         COEFFICIENTS_FILE.write_text(text + "\n", encoding="utf-8")
     if options.write:

@@ -196,6 +196,18 @@ def test_lists_without_overlap_are_all_wrong(tmp_path: Path, model_file: Path, m
     assert choice_fit.collect(options, MatchFilter(model=model_file, effort="full")) == []
 
 
+def test_the_limit_for_pairs_without_overlap_is_told() -> None:
+    p = np.linspace(0.0, 1.0, 1001)
+    apart = np.arange(1001) < 801
+    right = ~apart
+    said = choice_fit.describe_apart(p, right, apart, usable=0.4)
+    assert said.startswith("without overlap: 50.1 % of 801 lists are ok; at most 5 % from 0.76 on, with 100.0 %")
+    # A limit that is stricter already stays.
+    assert "0.0 % of 801 lists are ok; at most 5 % from 0.90 on, with 50.5 %" in choice_fit.describe_apart(
+        p, right, apart, usable=0.9
+    )
+
+
 def properties(path: Path) -> dict[str, str]:
     return {entry.key: entry.value for entry in onnx.load(str(path)).metadata_props}
 
@@ -243,7 +255,7 @@ def test_the_command_fits_tells_and_writes(
     def sample(i: int, early: bool) -> Sample:
         right = i % 3 > 0
         features = rng.normal(2.0 * right, 1.0, len(EARLY_FEATURES if early else FEATURES))
-        return Sample(features, right, f"scene {i % 12}", early)
+        return Sample(features, right, "apart 0" if i % 12 == 9 else f"scene {i % 12}", early)
 
     asked = []
     monkeypatch.setattr(
@@ -259,6 +271,7 @@ def test_the_command_fits_tells_and_writes(
     shown = capsys.readouterr().out
     assert "early_confidence: 300 lists" in shown
     assert "ok from" in shown
+    assert "without overlap: " in shown
     untouched = target.read_bytes()
     assert choice_fit.main(["--model", str(model), "--write"]) == 0  # without lists it writes what is there
     assert target.read_bytes() == untouched
