@@ -162,7 +162,7 @@ def parts_apart(one: Photograph, two: Photograph) -> tuple[Rectangle, Rectangle]
     The first is cut at one of a few places. Where the second may show anything of it, at any depth, is known then: the
     part of the second lies beyond.
     """
-    best, size = 0.0, None
+    largest, found = 0.0, None
     for axis in (0, 1):
         for cut in _CUTS:
             for below in (True, False):
@@ -179,9 +179,9 @@ def parts_apart(one: Photograph, two: Photograph) -> tuple[Rectangle, Rectangle]
                     length = two.size[axis]
                     edge = place.min(initial=length + margin) - margin if low else place.max(initial=-margin) + margin
                     share = min(cut if below else 1.0 - cut, edge / length if low else 1.0 - edge / length)
-                    if share >= _CUTS[0] and share > best:
-                        best, size = share, (part, _side(two.size, axis, edge, low))
-    return size
+                    if share >= _CUTS[0] and share > largest:
+                        largest, found = share, (part, _side(two.size, axis, edge, low))
+    return found
 
 
 def _side(size: tuple[int, int], axis: int, edge: float, below: bool) -> Rectangle:
