@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .. import detectors, focal_error, prefiltered_pairs, score_calibration, verdicts
+from .. import detectors, focal_error, no_overlap, prefiltered_pairs, score_calibration, verdicts
 from ..bad_input import __main__ as bad_input
 from .pages import fill_file, provenance
 
@@ -35,6 +35,10 @@ def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
         "verdicts": (
             verdicts.main,
             [photos, "--pairs", "1000", *places, "--bundles", bundles, "--store", store],
+        ),
+        "no_overlap": (
+            no_overlap.main,
+            ["--scenes", *(images for images, _ in options.scene), "--photos", photos, "--pairs", "48"],
         ),
         "score_calibration": (score_calibration.main, [bundles, *each]),
         "prefiltered_pairs": (

@@ -1,10 +1,11 @@
 """How sure is a pose? Fits the confidence of the robust fit, and writes all of its coefficients into a model file.
 
 ``python -m mgca_filter.export.choice_fit BUNDLES [BUNDLES …] --photos FOLDER --write`` runs the fit on lists of every
-kind that users have (raw, cross-checked, ratio-tested), of every detector that the folders hold, and on photographs of
-different places, which have no pose to find. A logistic regression on what the fit measures of its answer gives the
-probability that the pose is within 10 degrees; folds that keep scenes together tell how well. The coefficients go to
-``fit/choice.json`` and, with ``--write``, into the model file and the weights beside it.
+kind that users have (raw, cross-checked, ratio-tested), of every detector that the folders hold, and on photographs
+that have no pose to find: of different places, and of one place without overlap. A logistic regression on what the
+fit measures of its answer gives the probability that the pose is within 10 degrees; folds that keep scenes together
+tell how well. The coefficients go to ``fit/choice.json`` and, with ``--write``, into the model file and the weights
+beside it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from ..data.scene_bundle import SceneBundle, ScenePair
 from ..data.source import detect
 from ..evaluation.environment import one_thread
 from ..evaluation.metrics import FAILURE_DEG
-from ..features import match_features
+from ..features import create_detector, match_features
 from ..fit import choice
 from ..fit.choice import EARLY_FEATURES, FEATURES
 from ..fit.evidence import gather_before, gather_scored
@@ -36,6 +37,7 @@ from ..inference.model_file import SUMS_NAME, record_checksums
 from ..inputs.pair import MatchPair, prepare_pair
 from ..match_filter import MatchFilter, model_path
 from .calibration_fit import expected_calibration_error
+from .pairs_apart import CROSS_RATIO, lists_of, parts_of_photographs, plausible_camera, rendered_apart
 
 Array = NDArray[np.float64]
 
@@ -43,12 +45,16 @@ COEFFICIENTS_FILE = Path(choice.__file__).with_name("choice.json")
 RIGHT_DEG = 10.0
 FOLDS = 5
 KINDS = ("raw", "cross", "ratio", "cross and ratio")
-CROSS_RATIO, PLAIN_RATIO = 0.8, 0.75
+PLAIN_RATIO = 0.75
 # "ok" is said from the confidence on at which this share is right, and nothing below the second, which is chance's.
 OK_PRECISION, LEAST_CONFIDENCE = 0.96, 0.1
+# Of the pairs of one place without overlap this share may pass for "ok".
+APART_OK = 0.05
 # Of the poses that the bundles of a scene vouch for, so many of the easy ones agree with them (``QUALITY.csv``).
 LEAST_QUALITY = 0.92
-PLAUSIBLE_FOCAL_FACTOR = 0.9
+# What the lists of pairs without overlap are made with: as ``match_images`` does, and another kind of corners.
+APART_DETECTORS = (("rootsift", 4000), ("orb", 4000))
+APART = "apart"
 _RIDGE, _NEWTON_STEPS = 3e-3, 30
 # Pairs of different places are rarer here than anywhere else: each counts for so many.
 _UNRELATED_WEIGHT = 1.0
@@ -104,13 +110,21 @@ def unrelated_pairs(folder: Path, count: int, seed: int) -> Iterator[tuple[str, 
         ):
             attributes = matches.attributes.take(kept)
             points = one.points[matches.index1[kept]], two.points[matches.index2[kept]]
-            cameras = (_plausible_camera(one.image_size), _plausible_camera(two.image_size))
+            cameras = (plausible_camera(one.image_size), plausible_camera(two.image_size))
             yield f"{pairs[i][0].stem} {kind}", MatchPair(*points, None, *cameras, attributes=attributes)
 
 
-def _plausible_camera(size: tuple[int, int]) -> Array:
-    focal = PLAUSIBLE_FOCAL_FACTOR * max(size)
-    return np.array([[focal, 0.0, (size[0] - 1) / 2], [0.0, focal, (size[1] - 1) / 2], [0.0, 0.0, 1.0]])
+def apart_lists(folder: Path, count: int, seed: int) -> Iterator[tuple[str, MatchPair]]:
+    """Lists of pairs without overlap: ``count`` photographs of a folder cut in two, half as many of rendered worlds.
+
+    Yields:
+        The group, which begins with :data:`APART`, and the list.
+    """
+    detectors = [create_detector(*settings) for settings in APART_DETECTORS]
+    for pair in chain(parts_of_photographs(folder, count, seed), rendered_apart(folder, count // 2, seed)):
+        for detector in detectors:
+            for _, matches in lists_of(pair, detector):
+                yield f"{APART} {pair.place}", matches
 
 
 def samples_of(
@@ -211,6 +225,16 @@ def describe_verdicts(p: Array, right: NDArray[np.bool_], least: float, usable: 
     )
 
 
+def describe_apart(p: Array, right: NDArray[np.bool_], apart: NDArray[np.bool_], usable: float) -> str:
+    """How many lists without overlap are "ok", and the limit of the confidence that would make it few, in a line."""
+    limit = max(float(np.quantile(p[apart], 1.0 - APART_OK)), usable)
+    return (
+        f"without overlap: {100.0 * (p[apart] >= usable).mean():.1f} % of {np.count_nonzero(apart)} lists are ok; "
+        f"at most {100.0 * APART_OK:.0f} % from {limit:.2f} on, with {100.0 * (p[right] >= limit).mean():.1f} % of the "
+        "right ones"
+    )
+
+
 def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Sample]:
     """Samples of all lists."""
     sound = next((s for s in map(sound_scenes, options.bundles) if s is not None), None)
@@ -231,6 +255,8 @@ def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Samp
     if options.photos is not None:
         for name, matches in unrelated_pairs(options.photos, options.unrelated, options.seed):
             samples += samples_of(matches, None, f"unrelated {name}", match_filter)
+        for group, matches in apart_lists(options.photos, options.apart, options.seed):
+            samples += samples_of(matches, None, group, match_filter)
     return samples
 
 
@@ -289,6 +315,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--per-scene", type=int, default=2, metavar="N", help="pairs of each bundle (default 2)")
     parser.add_argument("--photos", type=Path, metavar="FOLDER", help="photographs, all of different places")
     parser.add_argument("--unrelated", type=int, default=150, metavar="N", help="pairs of photographs (default 150)")
+    parser.add_argument(
+        "--apart",
+        type=int,
+        default=80,
+        metavar="N",
+        help="photographs cut in two, and half as many rendered pairs, of one place without overlap (default 80)",
+    )
     parser.add_argument("--exclude", nargs="*", default=[], metavar="SCENE", help="scenes of doubtful poses")
     parser.add_argument("--model", type=Path, default=model_path(), help="whose scores are used")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
@@ -317,6 +350,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if not early:
                 coefficients["verdict"] = [LEAST_CONFIDENCE, usable_from(p, right)]
                 print(describe_verdicts(p, right, *coefficients["verdict"]))
+                apart = np.array([sample.group.startswith(APART) for sample in samples if not sample.early])
+                if apart.any():
+                    print(describe_apart(p, right, apart, coefficients["verdict"][1]))
         text = json.dumps(choice.check_coefficients(coefficients), indent=1)
         COEFFICIENTS_FILE.write_text(text + "\n", encoding="utf-8")
     if options.write:

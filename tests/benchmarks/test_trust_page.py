@@ -13,7 +13,7 @@ from benchmarks.fill_docs import pages, trust
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "trust.md"
-PLACES = ("bad_input", "verdicts", "score_calibration", "prefiltered_pairs", "focal_error", "detectors")
+PLACES = ("bad_input", "verdicts", "no_overlap", "score_calibration", "prefiltered_pairs", "focal_error", "detectors")
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import shutil
 from dataclasses import replace
@@ -16,7 +17,7 @@ from scene_bundles import write_bundle
 
 from mgca_filter import MatchFilter
 from mgca_filter.data.scene_bundle import SceneBundle
-from mgca_filter.export import choice_fit
+from mgca_filter.export import choice_fit, pairs_apart
 from mgca_filter.export.choice_fit import (
     Sample,
     area_under_roc,
@@ -169,10 +170,42 @@ def test_photographs_of_different_places_have_no_pose(tmp_path: Path) -> None:
     assert len(pairs) == 4  # each raw and filtered
     assert len({name for name, _ in pairs}) == 4
     for _, pair in pairs:
-        focal = choice_fit.PLAUSIBLE_FOCAL_FACTOR * 320
+        focal = pairs_apart.PLAUSIBLE_FOCAL_FACTOR * 320
         np.testing.assert_allclose(pair.K1, [[focal, 0, 159.5], [0, focal, 119.5], [0, 0, 1]])
     again = [name for name, _ in unrelated_pairs(tmp_path, 2, seed=0)]
     assert again == [name for name, _ in pairs]
+
+
+def test_lists_without_overlap_are_all_wrong(tmp_path: Path, model_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed in range(2):
+        noise = np.random.default_rng(seed).integers(0, 256, (60, 80), dtype=np.uint8)
+        cv2.imwrite(str(tmp_path / f"{seed}.png"), cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC))
+    monkeypatch.setattr(choice_fit, "APART_DETECTORS", (("sift", 100), ("orb", 100)))
+    groups = [group for group, _ in choice_fit.apart_lists(tmp_path, 2, seed=0)]
+    assert {group.split()[0] for group in groups} == {choice_fit.APART}
+    assert {"apart 0", "apart 1", "apart world 0"} == set(groups)
+    assert groups.count("apart world 0") >= 2  # of either detector
+    options = argparse.Namespace(
+        bundles=[], exclude=[], per_scene=1, seed=0, photos=tmp_path, unrelated=0, apart=2, model=model_file
+    )
+    samples = choice_fit.collect(options, MatchFilter(model=model_file, effort="full"))
+    assert {sample.group for sample in samples} <= set(groups)
+    assert len(samples) > 6
+    assert not any(sample.right for sample in samples)
+    options.apart = 0
+    assert choice_fit.collect(options, MatchFilter(model=model_file, effort="full")) == []
+
+
+def test_the_limit_for_pairs_without_overlap_is_told() -> None:
+    p = np.linspace(0.0, 1.0, 1001)
+    apart = np.arange(1001) < 801
+    right = ~apart
+    said = choice_fit.describe_apart(p, right, apart, usable=0.4)
+    assert said.startswith("without overlap: 50.1 % of 801 lists are ok; at most 5 % from 0.76 on, with 100.0 %")
+    # A limit that is stricter already stays.
+    assert "0.0 % of 801 lists are ok; at most 5 % from 0.90 on, with 50.5 %" in choice_fit.describe_apart(
+        p, right, apart, usable=0.9
+    )
 
 
 def properties(path: Path) -> dict[str, str]:
@@ -222,7 +255,7 @@ def test_the_command_fits_tells_and_writes(
     def sample(i: int, early: bool) -> Sample:
         right = i % 3 > 0
         features = rng.normal(2.0 * right, 1.0, len(EARLY_FEATURES if early else FEATURES))
-        return Sample(features, right, f"scene {i % 12}", early)
+        return Sample(features, right, "apart 0" if i % 12 == 9 else f"scene {i % 12}", early)
 
     asked = []
     monkeypatch.setattr(
@@ -238,6 +271,7 @@ def test_the_command_fits_tells_and_writes(
     shown = capsys.readouterr().out
     assert "early_confidence: 300 lists" in shown
     assert "ok from" in shown
+    assert "without overlap: " in shown
     untouched = target.read_bytes()
     assert choice_fit.main(["--model", str(model), "--write"]) == 0  # without lists it writes what is there
     assert target.read_bytes() == untouched
@@ -247,10 +281,8 @@ def test_excluded_and_unsound_scenes_are_left_out(tmp_path: Path, model_file: Pa
     for seed, name in enumerate(("hall", "yard", "roof", "hall.lightglue")):
         write_bundle(tmp_path / f"{name}.npz", [make_scene(seed=seed)])
     (tmp_path / "QUALITY.csv").write_text("scene,share_within_2px\nhall,0.99\nyard,0.5\nroof,0.97\n", encoding="utf-8")
-    import argparse
-
     options = argparse.Namespace(
-        bundles=[tmp_path], exclude=["roof"], per_scene=1, seed=0, photos=None, unrelated=0, model=model_file
+        bundles=[tmp_path], exclude=["roof"], per_scene=1, seed=0, photos=None, unrelated=0, apart=0, model=model_file
     )
     samples = choice_fit.collect(options, MatchFilter(model=model_file, effort="full"))
     assert {sample.group for sample in samples} == {"hall"}

@@ -46,7 +46,7 @@ def draw_scene(rng: np.random.Generator, count: int) -> tuple[World, list[Camera
         first = draw_camera(rng, world)
         thumbnail = first.shrunk(THUMBNAIL)
         seen = see(world, thumbnail)
-        if _is_free(seen, world):
+        if is_free(seen, world):
             break
     cameras = [first]
     for _ in range(count - 1):
@@ -56,7 +56,7 @@ def draw_scene(rng: np.random.Generator, count: int) -> tuple[World, list[Camera
             camera = draw_camera(rng, world, first)
             other = camera.shrunk(THUMBNAIL)
             other_seen = see(world, other)
-            if not _is_free(other_seen, world):
+            if not is_free(other_seen, world):
                 continue
             share = min(
                 visible_share(thumbnail, other, seen, other_seen), visible_share(other, thumbnail, other_seen, seen)
@@ -69,7 +69,8 @@ def draw_scene(rng: np.random.Generator, count: int) -> tuple[World, list[Camera
     return world, cameras
 
 
-def _is_free(visible: VisibilityMap, world: World) -> bool:
+def is_free(visible: VisibilityMap, world: World) -> bool:
+    """Whether nothing stands right before the lens."""
     return float(np.percentile(visible.inverse_depth, 90)) * NEAREST_ALLOWED * world.distance < 1.0
 
 
