@@ -252,7 +252,8 @@ class MatchFilter:
         else:
             verdict = judge(pair, job.model, job.evidence, threshold_px, choice, options)
         if job.focal is not None and verdict.status is Status.SUSPICIOUS_INTRINSICS:
-            verdict = replace(verdict, status=Status.LOW_SUPPORT)  # the intrinsics are nobody's claim
+            # The intrinsics are nobody's claim.
+            verdict = replace(verdict, status=Status.LOW_SUPPORT if verdict.H is None else Status.PLANAR)
         if job.focal is not None and verdict.status is Status.PLANAR:
             verdict = replace(verdict, E=None, R=None, t=None)  # a plane tells no focal length
         if not job.given and job.focal is None and options.geometry == "auto" and verdict.t is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import cross_matrix, sampson_distance
+from ..geometry.epipolar import cross_matrix, homogeneous
 from ..geometry.pose_refinement import rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -80,7 +80,8 @@ class FocalPairFit:
     """
 
     def __init__(self, rows: Array, threshold: float, noise: float, belief: FocalBelief) -> None:
-        self._rows, self._threshold, self._belief = rows, threshold, belief
+        self._x1, self._x2 = homogeneous(rows[:, :2]), homogeneous(rows[:, 2:])
+        self._threshold, self._belief = threshold, belief
         self._scale = 1.0 / (TEMPER * noise**2)
 
     def differing(self, R: Array, t: Array, log_factor: float) -> TwoFocals | None:
@@ -130,21 +131,27 @@ class FocalPairFit:
         return TwoFocals(R, t, logs, sigmas[:2], float(sigmas[2]), cost)
 
     def _distances(self, R: Array, t: Array, logs: Array) -> Array:
-        """Sampson distances (N,) in the unit of the guessed focal lengths, whatever the factors."""
+        """Signed Sampson distances (N,) in the unit of the guessed focal lengths, whatever the factors.
+
+        Next to zero a distance without sign has no derivative.
+        """
         shrink1, shrink2 = (np.diag([np.exp(-log), np.exp(-log), 1.0]) for log in logs)
-        return sampson_distance(self._rows, shrink2 @ cross_matrix(t) @ R @ shrink1)
+        M = shrink2 @ cross_matrix(t) @ R @ shrink1
+        lines2, lines1 = self._x1 @ M.T, self._x2 @ M
+        squared_norm = np.sum(lines2[:, :2] ** 2, axis=1) + np.sum(lines1[:, :2] ** 2, axis=1)
+        error = np.sum(self._x2 * lines2, axis=1)
+        return np.asarray(error / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny)))
 
     def _cost(self, distance: Array, logs: Array) -> float:
         if np.abs(logs).max() > _LARGEST_LOG or not np.isfinite(distance).all():
             return float("inf")
-        errors = float(np.minimum(distance, self._threshold) @ np.minimum(distance, self._threshold))
+        errors = float(np.minimum(distance**2, self._threshold**2).sum())
         belief = float(np.sum(((logs - self._belief.mean) / self._belief.spread) ** 2))
         return self._scale * errors + belief
 
     def _normal_equations(self, R: Array, t: Array, logs: Array, distance: Array) -> tuple[Array, Array]:
-        """Hessian (7, 7) and gradient (7,) over turns, moves of t and logarithms; distances have no sign, but neither
-        has the product of one with its derivative."""
-        near = distance < self._threshold
+        """Hessian (7, 7) and gradient (7,) over turns, moves of t and logarithms."""
+        near = np.abs(distance) < self._threshold
         columns = [
             (self._distances(*_moved(R, t, logs, _DIFFERENCE * unit))[near] - distance[near]) / _DIFFERENCE
             for unit in np.eye(7)
