@@ -218,8 +218,8 @@ def _test_rotation(
     if not degeneracy.explains(distance_px, REFINE_PX, support):
         return None
     F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
-    epipolar_px = sampson_distance(rows[near], F)
-    if pair.calibrated and not degeneracy.prefers_rotation(distance_px[near], epipolar_px):
+    # All of them, for those that agree with the model are chosen by how little noise they have along one direction.
+    if pair.calibrated and not degeneracy.prefers_rotation(distance_px, sampson_distance(rows, F)):
         return None
     verdict = _keep_homography(pair, H, Status.PURE_ROTATION, mask_threshold_px, info)
     return replace(verdict, R=R)

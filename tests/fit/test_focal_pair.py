@@ -16,7 +16,7 @@ GUESS = 1000.0
 def fitted(points1: np.ndarray, points2: np.ndarray, R: np.ndarray, t: np.ndarray, log_factor: float, noise: float):
     """The fit from the true pose under one focal length."""
     rows = np.hstack([points1 - K[:2, 2], points2 - K[:2, 2]]) / GUESS
-    return FocalPairFit(rows, 2.0 / GUESS, max(noise, 0.1) / GUESS, BELIEF).differing(R, t, log_factor)
+    return FocalPairFit(rows, 2.0 / GUESS, max(noise, 0.1) / GUESS, BELIEF).differing(R, t, log_factor)[0]
 
 
 def zoomed(zoom: float, noise: float = 0.0, seed: int = 0, kind: str = "skew", swap: bool = False) -> TwoFocals | None:
