@@ -10,7 +10,7 @@
 namespace mgca::detail {
 namespace {
 
-constexpr double kExplainedShare = 0.95, kExplainedThresholdFactor = 2.0, kMaxAccidentalShare = 0.3;
+constexpr double kExplainedShare = 0.95, kMaxAccidentalShare = 0.3;
 constexpr std::size_t kChanceRows = 400;
 constexpr int kTrimRounds = 5;
 constexpr int kModelFreedom = 5;

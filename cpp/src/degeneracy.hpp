@@ -12,6 +12,8 @@ constexpr int kMinSupport = 13;
 // Number of false alarms, log10: above the first the support is chance, above the second it is weak.
 constexpr double kUnrelatedLog10Nfa = 0.5, kLowSupportLog10Nfa = -1.0;
 constexpr double kIntrinsicsSupportFactor = 1.5;
+// A degenerate model explains what lies within this many thresholds of it.
+constexpr double kExplainedThresholdFactor = 2.0;
 // Keypoints are not better than this, and the median of absolute normal deviates times the second is their sigma.
 constexpr double kLeastNoisePx = 0.1;
 constexpr double kToSigma = 1.4826;
@@ -41,7 +43,7 @@ cv::Matx33d fit_rotation(const Correspondences& matches, double threshold);
 /// True where a rotation alone is the better model of the inliers than an essential matrix, noise considered: Torr's
 /// criterion GRIC (IJCV 2002).
 ///
-/// @param rotation_px distances of the inliers to the rotation's homography. epipolar_px: their Sampson distances to E.
+/// @param rotation_px Sampson distances of what bears witness to the rotation's homography. epipolar_px: the same to E.
 bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<double>& epipolar_px);
 
 double median(std::vector<double> values);

@@ -282,12 +282,21 @@ Result Filter::operator()(const MatchPair& matches) const {
                       ? detail::judge_homography(pair, *evidence, threshold_px, options_)
                       : detail::judge(pair, model, *evidence, threshold_px, metadata.choice, options_);
         if (focal && verdict.status == Status::suspicious_intrinsics) {
-            verdict.status = Status::low_support;  // the intrinsics are nobody's claim
+            // The intrinsics are nobody's claim.
+            verdict.status = verdict.H ? Status::planar : Status::low_support;
         }
         if (focal && verdict.status == Status::planar) {
             verdict.E.reset();  // a plane tells no focal length
             verdict.R.reset();
             verdict.t.reset();
+        }
+        if (focal && verdict.t) {
+            // The confidence takes the focal lengths for known.
+            const double sigma_deg = detail::pose_sigma_deg(*evidence, *model, *focal);
+            model->confidence = *model->confidence * detail::share_within_10_deg(sigma_deg);
+            if (verdict.status == Status::ok && *model->confidence < metadata.choice.verdict[1]) {
+                verdict.status = Status::low_support;
+            }
         }
         if (!given && !focal && options_.geometry == Geometry::automatic && verdict.t) {
             verdict.E.reset();  // nor do matches that no focal length explains

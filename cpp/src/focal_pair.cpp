@@ -42,12 +42,13 @@ std::array<cv::Vec3d, 2> householder_basis(const cv::Vec3d& t) {
 FocalPairFit::FocalPairFit(Correspondences rows, double threshold, double noise, const FocalBelief& belief)
     : rows_(std::move(rows)), threshold_(threshold), scale_(1.0 / (kTemper * noise * noise)), belief_(belief) {}
 
-std::optional<TwoFocals> FocalPairFit::differing(const Pose& pose, double log_factor) const {
+std::pair<std::optional<TwoFocals>, double> FocalPairFit::differing(const Pose& pose, double log_factor) const {
     const State shared{pose, {log_factor, log_factor}};
     const double before = cost(distances(shared), shared.logs);
     TwoFocals found = refined(shared);
+    const double sigma_beside = found.ratio_sigma;
     if (before - found.cost < kMinGain) {
-        return std::nullopt;
+        return {std::nullopt, sigma_beside};
     }
     for (const double zoom : kZooms) {
         const double half = 0.5 * std::log(zoom);
@@ -57,7 +58,21 @@ std::optional<TwoFocals> FocalPairFit::differing(const Pose& pose, double log_fa
         }
     }
     const double apart = std::abs(found.logs[1] - found.logs[0]);
-    return apart > std::max(kMinLogRatio, kMinRatioSigmas * found.ratio_sigma) ? std::optional(found) : std::nullopt;
+    const bool believed = apart > std::max(kMinLogRatio, kMinRatioSigmas * found.ratio_sigma);
+    return {believed ? std::optional(found) : std::nullopt, sigma_beside};
+}
+
+cv::Matx<double, 5, 2> FocalPairFit::pose_derivative(const Pose& pose) const {
+    const State state{pose, {0.0, 0.0}};
+    cv::Matx<double, 5, 5> hessian;
+    cv::Matx<double, 5, 2> mixed;
+    for (const Step& row : jacobian(state, distances(state))) {
+        const cv::Vec<double, 5> of_pose(row[0], row[1], row[2], row[3], row[4]);
+        hessian += of_pose * of_pose.t();
+        mixed += of_pose * cv::Matx<double, 1, 2>(row[5], row[6]);
+    }
+    hessian += (1e-9 * cv::trace(hessian) + 1e-12) * cv::Matx<double, 5, 5>::eye();
+    return -1.0 * hessian.solve(mixed, cv::DECOMP_LU);
 }
 
 FocalPairFit::State FocalPairFit::moved(const State& state, const Step& step) {
@@ -108,16 +123,28 @@ TwoFocals FocalPairFit::refined(State state) const {
 }
 
 std::vector<double> FocalPairFit::distances(const State& state) const {
-    // In the unit of the guessed focal lengths, whatever the factors.
+    // In the unit of the guessed focal lengths, whatever the factors. Next to zero a distance without sign has no
+    // derivative.
     const double shrink1 = std::exp(-state.logs[0]), shrink2 = std::exp(-state.logs[1]);
-    return sampson_distances(rows_, cv::Matx33d::diag({shrink2, shrink2, 1.0}) * cross_matrix(state.pose.t) *
-                                        state.pose.R * cv::Matx33d::diag({shrink1, shrink1, 1.0}));
+    const cv::Matx33d M = cv::Matx33d::diag({shrink2, shrink2, 1.0}) * cross_matrix(state.pose.t) * state.pose.R *
+                          cv::Matx33d::diag({shrink1, shrink1, 1.0});
+    std::vector<double> signed_distances;
+    signed_distances.reserve(rows_.size());
+    for (const Correspondence& row : rows_) {
+        const cv::Vec3d x1(row[0], row[1], 1.0), x2(row[2], row[3], 1.0);
+        const cv::Vec3d line2 = M * x1, line1 = M.t() * x2;
+        const double squared_norm =
+            line2[0] * line2[0] + line2[1] * line2[1] + line1[0] * line1[0] + line1[1] * line1[1];
+        signed_distances.push_back(x2.dot(line2) /
+                                   std::sqrt(std::max(squared_norm, std::numeric_limits<double>::min())));
+    }
+    return signed_distances;
 }
 
 double FocalPairFit::cost(const std::vector<double>& distances, const cv::Vec2d& logs) const {
     double errors = 0.0, belief = 0.0;
     for (const double distance : distances) {
-        const double cut = std::min(distance, threshold_);
+        const double cut = std::min(std::abs(distance), threshold_);
         errors += std::isfinite(distance) ? cut * cut : std::numeric_limits<double>::infinity();
     }
     for (const double log : logs.val) {
@@ -130,26 +157,37 @@ double FocalPairFit::cost(const std::vector<double>& distances, const cv::Vec2d&
     return scale_ * errors + belief;
 }
 
-FocalPairFit::NormalEquations FocalPairFit::normal_equations(const State& state,
-                                                             const std::vector<double>& distance) const {
+std::vector<FocalPairFit::Step> FocalPairFit::jacobian(const State& state, const std::vector<double>& distance) const {
     std::array<std::vector<double>, 7> beside;
     for (int k = 0; k < 7; ++k) {
         Step step;
         step[k] = kDerivativeStep;
         beside[static_cast<std::size_t>(k)] = distances(moved(state, step));
     }
-    // Distances have no sign, but neither has the product of one with its derivative.
-    NormalEquations equations;
+    std::vector<Step> rows;
     for (std::size_t i = 0; i < distance.size(); ++i) {
-        if (!(distance[i] < threshold_)) {
-            continue;
+        if (std::abs(distance[i]) < threshold_) {
+            Step row;
+            for (int k = 0; k < 7; ++k) {
+                row[k] = (beside[static_cast<std::size_t>(k)][i] - distance[i]) / kDerivativeStep;
+            }
+            rows.push_back(row);
         }
-        Step row;
-        for (int k = 0; k < 7; ++k) {
-            row[k] = (beside[static_cast<std::size_t>(k)][i] - distance[i]) / kDerivativeStep;
+    }
+    return rows;
+}
+
+FocalPairFit::NormalEquations FocalPairFit::normal_equations(const State& state,
+                                                             const std::vector<double>& distance) const {
+    NormalEquations equations;
+    const std::vector<Step> rows = jacobian(state, distance);
+    auto row = rows.begin();
+    for (const double value : distance) {
+        if (std::abs(value) < threshold_) {
+            equations.hessian += scale_ * (*row * row->t());
+            equations.gradient += scale_ * value * *row;
+            ++row;
         }
-        equations.hessian += scale_ * (row * row.t());
-        equations.gradient += scale_ * distance[i] * row;
     }
     const double sharpness = 1.0 / (belief_.spread * belief_.spread);
     for (const int k : {5, 6}) {

@@ -1,6 +1,7 @@
 #include "homography_fit.hpp"
 
 #include "degeneracy.hpp"
+#include "evidence.hpp"
 
 #include <algorithm>
 #include <array>
@@ -35,6 +36,9 @@ constexpr double kCauchySigmas = 1.25;
 constexpr int kPolishRounds = 6;
 // Least squares.
 constexpr double kInitialDamping = 1e-6, kMaxDamping = 1e3, kConvergedDecrease = 1e-9;
+// Planes are seldom perfect: a match is off the plane beyond this multiple of the threshold. Once H is known, two matches
+// off the plane determine the fundamental matrix; the scene has depth where their log10 NFA is below the last.
+constexpr double kOffPlaneFactor = 2.0, kParallaxFreedom = 2.0, kParallaxLog10Nfa = -5.0;
 // Chance.
 constexpr std::size_t kChanceRows = 400, kSmallestChanceHead = 16;
 constexpr std::array<double, 3> kThresholdFactors{0.5, 1.0, 2.0};
@@ -208,6 +212,34 @@ public:
             draw();
         }
         return best_ ? std::optional(polish(*best_)) : std::nullopt;
+    }
+
+    /// Least squares with Cauchy weights at the scale of the noise, among the inliers.
+    cv::Matx33d polish(cv::Matx33d H) const {
+        for (int round = 0; round < kPolishRounds; ++round) {
+            std::vector<double> squared, near;
+            for (const Correspondence& row : rows_) {
+                squared.push_back(Residual(row, H).squared);
+                if (squared.back() < threshold_ * threshold_) {
+                    near.push_back(squared.back());
+                }
+            }
+            if (2 * static_cast<int>(near.size()) <= kFreedom) {
+                return H;
+            }
+            // The median of a Rayleigh distribution is 1.18 of its standard deviation.
+            const double scale = std::max(kCauchySigmas * std::sqrt(median(near)) / 1.18, 1e-12);
+            std::vector<double> weights;
+            for (const double value : squared) {
+                weights.push_back(1.0 / (1.0 + (value < threshold_ * threshold_ ? value : 0.0) / (scale * scale)));
+            }
+            const cv::Matx33d polished = refine(rows_, H, threshold_, weights, 3);
+            if (!possible(polished)) {
+                return H;
+            }
+            H = polished;
+        }
+        return H;
     }
 
 private:
@@ -395,34 +427,6 @@ private:
         return false;
     }
 
-    /// Least squares with Cauchy weights at the scale of the noise, among the inliers.
-    cv::Matx33d polish(cv::Matx33d H) const {
-        for (int round = 0; round < kPolishRounds; ++round) {
-            std::vector<double> squared, near;
-            for (const Correspondence& row : rows_) {
-                squared.push_back(Residual(row, H).squared);
-                if (squared.back() < threshold_ * threshold_) {
-                    near.push_back(squared.back());
-                }
-            }
-            if (2 * static_cast<int>(near.size()) <= kFreedom) {
-                return H;
-            }
-            // The median of a Rayleigh distribution is 1.18 of its standard deviation.
-            const double scale = std::max(kCauchySigmas * std::sqrt(median(near)) / 1.18, 1e-12);
-            std::vector<double> weights;
-            for (const double value : squared) {
-                weights.push_back(1.0 / (1.0 + (value < threshold_ * threshold_ ? value : 0.0) / (scale * scale)));
-            }
-            const cv::Matx33d polished = refine(rows_, H, threshold_, weights, 3);
-            if (!possible(polished)) {
-                return H;
-            }
-            H = polished;
-        }
-        return H;
-    }
-
     Correspondences rows_;
     std::vector<double> weights_, ones_;
     double threshold_;
@@ -492,14 +496,44 @@ Mask independent(const Correspondences& matches, const std::vector<double>& dist
 
 double log_binomial(double n, double k) { return std::lgamma(n + 1.0) - std::lgamma(k + 1.0) - std::lgamma(n - k + 1.0); }
 
-double plane_log10_nfa(std::size_t count, std::size_t inliers, double rate) {
-    constexpr double kFree = kFreedom / 2;
+double plane_log10_nfa(std::size_t count, std::size_t inliers, double rate, double freedom = kFreedom / 2) {
     const auto n = static_cast<double>(count), k = static_cast<double>(inliers);
-    if (k <= kFree) {
+    if (k <= freedom) {
         return kInfinity;
     }
-    const double tests = std::log(n) + log_binomial(n, k) + log_binomial(k, kFree);
-    return (tests + (k - kFree) * std::log(std::min(rate, 1.0))) / std::log(10.0);
+    const double tests = std::log(n) + log_binomial(n, k) + log_binomial(k, freedom);
+    return (tests + (k - freedom) * std::log(std::min(rate, 1.0))) / std::log(10.0);
+}
+
+/// Points of both images centred and of unit size: x_unit ~ to_unit x.
+struct UnitFrame {
+    Correspondence centre;
+    double unit = 1.0;
+
+    cv::Matx33d to_unit(int image) const {
+        return {1.0, 0.0, -centre[2 * image], 0.0, 1.0, -centre[2 * image + 1], 0.0, 0.0, unit};
+    }
+};
+
+/// Nothing where they have no extent.
+std::optional<UnitFrame> unit_frame(const Correspondences& rows) {
+    UnitFrame frame;
+    for (const Correspondence& row : rows) {
+        frame.centre += row;
+    }
+    frame.centre *= 1.0 / static_cast<double>(rows.size());
+    double sum = 0.0;
+    for (const Correspondence& row : rows) {
+        sum += (row - frame.centre).dot(row - frame.centre);
+    }
+    frame.unit = std::sqrt(sum / (4.0 * static_cast<double>(rows.size())));
+    return std::isfinite(frame.unit) && frame.unit > 0.0 ? std::optional(frame) : std::nullopt;
+}
+
+/// OpenCV's scale, H(2, 2) = 1, where the origin is not mapped to infinity.
+cv::Matx33d scaled(const cv::Matx33d& given) {
+    const cv::Matx33d H = unit_norm(given);
+    return std::abs(H(2, 2)) > 1e-12 ? H * (1.0 / H(2, 2)) : H;
 }
 
 }  // namespace
@@ -527,34 +561,57 @@ std::optional<cv::Matx33d> estimate_homography(const Correspondences& matches, c
         return std::nullopt;
     }
     Correspondences rows;
-    Correspondence centre;
     for (const std::size_t i : order) {
         rows.push_back(matches[i]);
-        centre += matches[i];
     }
-    centre *= 1.0 / static_cast<double>(rows.size());
-    double sum = 0.0;
-    for (const Correspondence& row : rows) {
-        sum += (row - centre).dot(row - centre);
-    }
-    const double unit = std::sqrt(sum / (4.0 * static_cast<double>(rows.size())));
-    if (!std::isfinite(unit) || !(unit > 0.0)) {
+    const auto frame = unit_frame(rows);
+    if (!frame) {
         return std::nullopt;
     }
     std::vector<double> weight = multiplicity(rows);
     for (std::size_t k = 0; k < rows.size(); ++k) {
         const double given = weights.empty() ? 1.0 : std::clamp(weights[order[k]], 0.0, 1.0);
         weight[k] = std::max(given, kLeastWeight) / weight[k];
-        rows[k] = (rows[k] - centre) / unit;
+        rows[k] = (rows[k] - frame->centre) / frame->unit;
     }
-    const auto found = PlaneSearch(std::move(rows), std::move(weight), options.threshold / unit, options).run();
-    if (!found) {
-        return std::nullopt;
+    const auto found = PlaneSearch(std::move(rows), std::move(weight), options.threshold / frame->unit, options).run();
+    return found ? std::optional(scaled(frame->to_unit(1).inv() * *found * frame->to_unit(0))) : std::nullopt;
+}
+
+cv::Matx33d polish_homography(const Correspondences& matches, const cv::Matx33d& H, const HomographyOptions& options) {
+    Rows distinct = distinct_rows(matches);
+    std::sort(distinct.begin(), distinct.end());
+    Correspondences rows;
+    for (const std::size_t i : distinct) {
+        rows.push_back(matches[i]);
     }
-    const cv::Matx33d to_unit1(1.0, 0.0, -centre[0], 0.0, 1.0, -centre[1], 0.0, 0.0, unit);
-    const cv::Matx33d to_unit2(1.0, 0.0, -centre[2], 0.0, 1.0, -centre[3], 0.0, 0.0, unit);
-    const cv::Matx33d H = unit_norm(to_unit2.inv() * *found * to_unit1);
-    return std::abs(H(2, 2)) > 1e-12 ? H * (1.0 / H(2, 2)) : H;
+    const auto frame = rows.size() < kSampleSize ? std::nullopt : unit_frame(rows);
+    if (!frame || !std::all_of(H.val, H.val + 9, [](double value) { return std::isfinite(value); })) {
+        return H;
+    }
+    const cv::Matx33d start = unit_norm(frame->to_unit(1) * facing(rows, H) * frame->to_unit(0).inv());
+    for (Correspondence& row : rows) {
+        row = (row - frame->centre) / frame->unit;
+    }
+    std::vector<double> ones(rows.size(), 1.0);
+    const PlaneSearch search(std::move(rows), std::move(ones), options.threshold / frame->unit, options);
+    return scaled(frame->to_unit(1).inv() * search.polish(start) * frame->to_unit(0));
+}
+
+bool homography_explains(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F, double threshold) {
+    const std::vector<double> to_plane = sampson_distances_to_homography(matches, H);
+    Correspondences off;
+    for (std::size_t i = 0; i < matches.size(); ++i) {
+        if (to_plane[i] > kOffPlaneFactor * threshold) {
+            off.push_back(matches[i]);
+        }
+    }
+    if (static_cast<double>(off.size()) <= kParallaxFreedom) {
+        return true;
+    }
+    const Mask witnesses = independent(off, sampson_distances(off, F), threshold, 2.0 * threshold);
+    const auto count = static_cast<std::size_t>(std::count(witnesses.begin(), witnesses.end(), 1));
+    return plane_log10_nfa(off.size(), count, chance_rate(off, F, threshold), kParallaxFreedom) > kParallaxLog10Nfa;
 }
 
 PlaneSupport plane_support(const Correspondences& matches, const cv::Matx33d& H, double threshold) {

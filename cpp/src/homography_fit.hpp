@@ -27,6 +27,17 @@ struct HomographyOptions {
 std::optional<cv::Matx33d> estimate_homography(const Correspondences& matches, const HomographyOptions& options,
                                                const std::vector<double>& weights);
 
+/// Least squares on all matches that agree with a homography, from a good one; it comes back where they are too few.
+///
+/// @param matches finite, in the unit of H.
+cv::Matx33d polish_homography(const Correspondences& matches, const cv::Matx33d& H, const HomographyOptions& options);
+
+/// True where one homography explains the pair as well as the epipolar model does: the matches off the plane that agree
+/// with the model are no more than chance gathers.
+///
+/// @param matches in pixels, as F; the best first. threshold: Sampson distance of an inlier.
+bool homography_explains(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F, double threshold);
+
 /// log10 of the number of homographies that chance would support as well, on matches in pixels, the best first.
 double homography_false_alarms(const Correspondences& matches, const cv::Matx33d& H, double threshold);
 

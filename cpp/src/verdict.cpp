@@ -18,6 +18,8 @@ constexpr double kFundamentalThresholdPx = 1.0;
 constexpr int kFundamentalIterations = 1000;
 // A plane in doubt is looked for quickly first, at a generous threshold.
 constexpr double kQuickPlanePx = 3.0, kPlanePx = 2.0;
+// A plane on which fewer of the inliers lie is one of several of a scene with depth.
+constexpr double kLeastPlaneShare = 0.7;
 
 Correspondences valid_matches(const PairInput& pair) {
     Correspondences valid;
@@ -143,14 +145,15 @@ bool test_rotation(const PairInput& pair, const TwoViewModel& model, const Corre
                    const Correspondences& inliers, const Support& support, double mask_threshold_px, Verdict& verdict) {
     const cv::Matx33d R = fit_rotation(inliers, kRefinePx / pair.focal_px());
     const cv::Matx33d H = pair.intrinsics2.K * R * pair.intrinsics1.K.inv();
-    if (!explains(homography_distances(in_pixels(pair, fitted), H), kRefinePx, support)) {
+    // Of a zoom both in pixels, whose noise is that of the keypoints in either image.
+    const Correspondences pixels = in_pixels(pair, fitted);
+    const std::vector<double> rotation_px = sampson_distances_to_homography(pixels, H);
+    if (!explains(rotation_px, kRefinePx, support)) {
         return false;
     }
-    std::vector<double> epipolar_px = sampson_distances(inliers, model.M);
-    for (double& distance : epipolar_px) {
-        distance *= pair.focal_px();
-    }
-    if (pair.calibrated() && !prefers_rotation(homography_distances(in_pixels(pair, inliers), H), epipolar_px)) {
+    // All of them, for those that agree with the model are chosen by how little noise they have along one direction.
+    const cv::Matx33d F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K);
+    if (pair.calibrated() && !prefers_rotation(rotation_px, sampson_distances(pixels, F))) {
         return false;
     }
     keep_homography(pair, H, Status::pure_rotation, mask_threshold_px, verdict);
@@ -166,22 +169,56 @@ HomographyOptions plane_options(const Options& options) {
     return result;
 }
 
-/// The homography of the pixels that the matches support best.
-std::optional<cv::Matx33d> best_homography(const PairInput& pair, const Evidence& evidence, const Options& options) {
+/// The homography after least squares on all matches that agree with it: also on those that the network did not see,
+/// which hardly meet a homography by accident.
+cv::Matx33d polished_on_all(const PairInput& pair, const cv::Matx33d& H, const Options& options) {
+    return polish_homography(in_pixels(pair, valid_matches(pair)), H, plane_options(options));
+}
+
+/// The homography of the pixels that the matches support best, before that.
+std::optional<cv::Matx33d> supported_homography(const PairInput& pair, const Evidence& evidence,
+                                                const Options& options) {
     return estimate_homography(in_pixels(pair, evidence.correspondences), plane_options(options),
                                evidence.network ? evidence.network->scores : std::vector<double>{});
 }
 
-/// The verdict with the homography that explains the inliers as well, where there is one.
-void test_plane(const PairInput& pair, const Evidence& evidence, const Correspondences& inliers,
-                const Support& support, const Options& options, Verdict& verdict) {
+/// The same after it; the given one where none is found.
+cv::Matx33d best_homography(const PairInput& pair, const Evidence& evidence, const Options& options,
+                            const cv::Matx33d& quick) {
+    const auto H = supported_homography(pair, evidence, options);
+    return H ? polished_on_all(pair, *H, options) : quick;
+}
+
+/// The verdict with the homography that explains the inliers as well, where there is one: nearly all of them; or most,
+/// and the others are no more than what an epipolar model, which is free to move about a plane, gathers by accident.
+///
+/// @param fitted what bears witness. inliers: those that agree with the model.
+void test_plane(const PairInput& pair, const TwoViewModel& model, const Evidence& evidence,
+                const Correspondences& fitted, const Correspondences& inliers, const Support& support,
+                const Options& options, Verdict& verdict) {
     const Correspondences pixels = in_pixels(pair, inliers);
     const auto quick = fit_homography(pixels, kHomographyThresholdFactor * kRefinePx, options.seed);
-    if (!quick || !explains(homography_distances(pixels, *quick), kRefinePx, support)) {
+    if (!quick) {
         return;
     }
+    const std::vector<double> distances = homography_distances(pixels, *quick);
+    const bool explained = explains(distances, kRefinePx, support);
+    const auto near = std::count_if(distances.begin(), distances.end(), [](double distance) {
+        return distance < kExplainedThresholdFactor * kRefinePx;
+    });
+    if (!explained && static_cast<double>(near) < kLeastPlaneShare * static_cast<double>(distances.size())) {
+        return;
+    }
+    const cv::Matx33d H = best_homography(pair, evidence, options, *quick);
+    if (!explained) {
+        const Correspondences witnesses = in_pixels(pair, fitted);
+        const cv::Matx33d F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K);
+        if (!homography_explains(witnesses, *quick, F, kRefinePx) && !homography_explains(witnesses, H, F, kRefinePx)) {
+            return;
+        }
+    }
     verdict.status = Status::planar;
-    verdict.H = pair.homography_in_units(best_homography(pair, evidence, options).value_or(*quick));
+    verdict.H = pair.homography_in_units(H);
     if (!pair.calibrated()) {
         // Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
         verdict.E.reset();
@@ -199,7 +236,7 @@ Verdict plane_or(const Verdict& verdict, const PairInput& pair, const Evidence& 
     if (!quick || homography_false_alarms(sharp, *quick, kPlanePx) > kMeaningfulLog10Nfa) {
         return verdict;
     }
-    const cv::Matx33d H = best_homography(pair, evidence, options).value_or(*quick);
+    const cv::Matx33d H = best_homography(pair, evidence, options, *quick);
     const double log10_nfa = homography_false_alarms(rows, H, kPlanePx);
     const std::vector<double> distances = sampson_distances_to_homography(sharp, H);
     const auto agreeing = static_cast<int>(
@@ -268,14 +305,13 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
         verdict.status = Status::low_support;
         return verdict;
     }
+    test_plane(pair, *model, evidence, fitted, inliers, support, options, verdict);
     if (pair.calibrated()) {
         verdict.focal_factor = better_focal_factor(fitted, model->pose, threshold);
         if (verdict.focal_factor) {
             verdict.status = Status::suspicious_intrinsics;
-            return verdict;
         }
     }
-    test_plane(pair, evidence, inliers, support, options, verdict);
     return verdict;
 }
 
@@ -287,7 +323,7 @@ Verdict judge_homography(const PairInput& pair, const Evidence& evidence, double
         verdict.status = Status::too_few_matches;
         return verdict;
     }
-    const auto H = best_homography(pair, evidence, options);
+    const auto H = supported_homography(pair, evidence, options);
     if (!H) {
         return verdict;
     }
@@ -304,7 +340,7 @@ Verdict judge_homography(const PairInput& pair, const Evidence& evidence, double
     verdict.log10_false_alarms = support.log10_nfa;
     verdict.status = Status::unrelated;
     if (support.log10_nfa < kMeaningfulLog10Nfa) {
-        keep_homography(pair, *H, Status::ok, mask_threshold_px, verdict);
+        keep_homography(pair, polished_on_all(pair, *H, options), Status::ok, mask_threshold_px, verdict);
     }
     return verdict;
 }

@@ -130,22 +130,22 @@ def fit_rotation(correspondences: Array, threshold: float) -> Array:
 
 
 def prefers_rotation(rotation_px: Array, epipolar_px: Array) -> bool:
-    """True where a rotation alone is the better model of the inliers than an essential matrix, noise considered.
+    """True where a rotation alone is the better model of the matches than an essential matrix, noise considered.
 
     Torr's criterion GRIC (IJCV 2002): squared residuals in units of the noise, cut off far out, and a price for the
     dimension of the model's manifold, one more for E's, and for its parameters. A camera that moves a little leaves
     more of the matches than noise would, however few pixels that is.
 
     Args:
-        rotation_px: (N,) distances of the inliers to the rotation's homography, as ``homography_distance`` gives them;
-            those so far off that they agree with E by accident are left out.
+        rotation_px: (N,) Sampson distances of what bears witness to the rotation's homography; what is so far off that
+            it is wrong, or agrees with E by accident, is left out.
         epipolar_px: (N,) their Sampson distances to E.
     """
     turned = rotation_px < 2.0 * EXPLAINED_THRESHOLD_FACTOR
     rotation_px, epipolar_px = rotation_px[turned], epipolar_px[turned]
     count = len(epipolar_px)
     noise = max(TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
-    # Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
+    # The root of two squared components: of noise alone their expectation is twice that of a distance to E.
     costs = [float(np.minimum((d / noise) ** 2, _GRIC_CUT**2).sum()) for d in (rotation_px, epipolar_px)]
     # Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
     price = _PRICE_OF_DIMENSION * count + 2.0 * log(4.0 * count)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import cross_matrix, sampson_distance
+from ..geometry.epipolar import cross_matrix, homogeneous
 from ..geometry.pose_refinement import rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -80,26 +80,44 @@ class FocalPairFit:
     """
 
     def __init__(self, rows: Array, threshold: float, noise: float, belief: FocalBelief) -> None:
-        self._rows, self._threshold, self._belief = rows, threshold, belief
+        self._x1, self._x2 = homogeneous(rows[:, :2]), homogeneous(rows[:, 2:])
+        self._threshold, self._belief = threshold, belief
         self._scale = 1.0 / (TEMPER * noise**2)
 
-    def differing(self, R: Array, t: Array, log_factor: float) -> TwoFocals | None:
+    def differing(self, R: Array, t: Array, log_factor: float) -> tuple[TwoFocals | None, float]:
         """The best with two focal lengths, or None where one does about as well.
 
         Args:
             R, t, log_factor: pose and logarithm of the factor on both guesses that suit the matches best.
+
+        Returns:
+            The best, and how surely one does as well: the standard deviation of the logarithm of the ratio about it.
         """
         shared = np.array([log_factor, log_factor])
         before = self._cost(self._distances(R, t, shared), shared)
-        found = self._refined(R, t, shared)
+        beside = found = self._refined(R, t, shared)
         if before - found.cost < MIN_GAIN:
-            return None
+            return None, beside.ratio_sigma
         for zoom in _ZOOMS:
             half = 0.5 * np.log(zoom)
             other = self._refined(R, t, shared + np.array([-half, half]))
             if other.cost < found.cost:
                 found = other
-        return found if abs(found.log_ratio) > max(MIN_LOG_RATIO, MIN_RATIO_SIGMAS * found.ratio_sigma) else None
+        apart = abs(found.log_ratio) > max(MIN_LOG_RATIO, MIN_RATIO_SIGMAS * found.ratio_sigma)
+        return found if apart else None, beside.ratio_sigma
+
+    def pose_derivative(self, R: Array, t: Array) -> Array:
+        """How the best pose moves with the logarithms of both focal lengths, (5, 2): turns and moves of t, radians.
+
+        Args:
+            R, t: the pose that suits the matches best under the guessed focal lengths.
+        """
+        logs = np.zeros(2)
+        jacobian = self._jacobian(R, t, logs, self._distances(R, t, logs))
+        pose, focals = jacobian[:, :5], jacobian[:, 5:]
+        hessian = pose.T @ pose
+        damping = 1e-9 * float(np.trace(hessian)) * np.eye(5) + 1e-12 * np.eye(5)
+        return -np.asarray(np.linalg.solve(hessian + damping, pose.T @ focals), dtype=np.float64)
 
     def _refined(self, R: Array, t: Array, logs: Array) -> TwoFocals:
         """Levenberg–Marquardt from a start."""
@@ -130,31 +148,41 @@ class FocalPairFit:
         return TwoFocals(R, t, logs, sigmas[:2], float(sigmas[2]), cost)
 
     def _distances(self, R: Array, t: Array, logs: Array) -> Array:
-        """Sampson distances (N,) in the unit of the guessed focal lengths, whatever the factors."""
+        """Signed Sampson distances (N,) in the unit of the guessed focal lengths, whatever the factors.
+
+        Next to zero a distance without sign has no derivative.
+        """
         shrink1, shrink2 = (np.diag([np.exp(-log), np.exp(-log), 1.0]) for log in logs)
-        return sampson_distance(self._rows, shrink2 @ cross_matrix(t) @ R @ shrink1)
+        M = shrink2 @ cross_matrix(t) @ R @ shrink1
+        lines2, lines1 = self._x1 @ M.T, self._x2 @ M
+        squared_norm = np.sum(lines2[:, :2] ** 2, axis=1) + np.sum(lines1[:, :2] ** 2, axis=1)
+        error = np.sum(self._x2 * lines2, axis=1)
+        return np.asarray(error / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny)))
 
     def _cost(self, distance: Array, logs: Array) -> float:
         if np.abs(logs).max() > _LARGEST_LOG or not np.isfinite(distance).all():
             return float("inf")
-        errors = float(np.minimum(distance, self._threshold) @ np.minimum(distance, self._threshold))
+        errors = float(np.minimum(distance**2, self._threshold**2).sum())
         belief = float(np.sum(((logs - self._belief.mean) / self._belief.spread) ** 2))
         return self._scale * errors + belief
 
     def _normal_equations(self, R: Array, t: Array, logs: Array, distance: Array) -> tuple[Array, Array]:
-        """Hessian (7, 7) and gradient (7,) over turns, moves of t and logarithms; distances have no sign, but neither
-        has the product of one with its derivative."""
-        near = distance < self._threshold
+        """Hessian (7, 7) and gradient (7,) over turns, moves of t and logarithms."""
+        jacobian = self._jacobian(R, t, logs, distance)
+        hessian = self._scale * (jacobian.T @ jacobian)
+        gradient = self._scale * (jacobian.T @ distance[np.abs(distance) < self._threshold])
+        hessian[[5, 6], [5, 6]] += 1.0 / self._belief.spread**2
+        gradient[5:] += (logs - self._belief.mean) / self._belief.spread**2
+        return hessian, gradient
+
+    def _jacobian(self, R: Array, t: Array, logs: Array, distance: Array) -> Array:
+        """Derivatives (K, 7) of the distances within the threshold."""
+        near = np.abs(distance) < self._threshold
         columns = [
             (self._distances(*_moved(R, t, logs, _DIFFERENCE * unit))[near] - distance[near]) / _DIFFERENCE
             for unit in np.eye(7)
         ]
-        jacobian = np.stack(columns, axis=1)
-        hessian = self._scale * (jacobian.T @ jacobian)
-        gradient = self._scale * (jacobian.T @ distance[near])
-        hessian[[5, 6], [5, 6]] += 1.0 / self._belief.spread**2
-        gradient[5:] += (logs - self._belief.mean) / self._belief.spread**2
-        return hessian, gradient
+        return np.stack(columns, axis=1)
 
 
 def _moved(R: Array, t: Array, logs: Array, step: Array) -> tuple[Array, Array, Array]:

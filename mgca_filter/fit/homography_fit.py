@@ -140,6 +140,23 @@ def estimate_homography(
     return HomographyFit(scaled_homography(H), everywhere, everywhere < options.threshold, support)
 
 
+def polish_homography(correspondences: Array, H: Array, options: HomographyOptions = HomographyOptions()) -> Array:
+    """Least squares on all matches that agree with a homography, from a good one.
+
+    Args:
+        correspondences: (N, 4), finite, in the unit of ``H``. H: (3, 3). options: the threshold, and the reflection.
+
+    Returns:
+        (3, 3) of OpenCV's scale; ``H`` where the matches are too few or the result is no plane's.
+    """
+    with np.errstate(all="ignore"):
+        rows = correspondences[np.sort(distinct_rows(correspondences))]
+        search = _Search.of(rows, np.ones(len(rows)), np.arange(len(rows)), None, options)
+        if search is None or not np.isfinite(H).all():
+            return H
+        return scaled_homography(search.in_original_unit(search.polished(search.in_search_unit(facing(rows, H)))))
+
+
 class _Search:
     """Hypotheses of one pair, and the best so far; points are centred and of unit size."""
 
@@ -188,11 +205,20 @@ class _Search:
 
     def in_original_unit(self, H: Array) -> Array:
         """``H`` between the points as they came in."""
-        to_unit1, to_unit2 = (
+        to_unit1, to_unit2 = self._to_unit()
+        return np.asarray(np.linalg.inv(to_unit2) @ H @ to_unit1, dtype=np.float64)
+
+    def in_search_unit(self, H: Array) -> Array:
+        """``H`` of the points as they came in between those that are centred and of unit size, of unit norm."""
+        to_unit1, to_unit2 = self._to_unit()
+        H = to_unit2 @ H @ np.linalg.inv(to_unit1)
+        return np.asarray(H / np.linalg.norm(H), dtype=np.float64)
+
+    def _to_unit(self) -> list[Array]:
+        return [
             np.array([[1.0, 0.0, -c[0]], [0.0, 1.0, -c[1]], [0.0, 0.0, self._unit]])
             for c in (self._centres[:2], self._centres[2:])
-        )
-        return np.asarray(np.linalg.inv(to_unit2) @ H @ to_unit1, dtype=np.float64)
+        ]
 
     def run(self) -> Array | None:
         """The best-supported map (3, 3), polished, or None."""
@@ -206,7 +232,7 @@ class _Search:
                 break
         if self._best is None:
             return None
-        return self._polish(self._best)
+        return self.polished(self._best)
 
     # 1. Samples
 
@@ -357,7 +383,7 @@ class _Search:
 
     # 4. Polish
 
-    def _polish(self, H: Array) -> Array:
+    def polished(self, H: Array) -> Array:
         """Least squares with Cauchy weights at the scale of the noise, among the inliers."""
         ones = np.ones(len(self._rows))
         for _ in range(_POLISH_ROUNDS):

@@ -25,8 +25,9 @@ Array = NDArray[np.float64]
 
 # log10 of the number of false alarms below which a homography is more than chance.
 MEANINGFUL_LOG10_NFA = -2.0
-# log10 of the number of false alarms of the matches off the plane below which the scene has depth.
-PARALLAX_LOG10_NFA = -2.0
+# log10 of the number of false alarms of the matches off the plane below which the scene has depth: below that of
+# chance, for wrong matches of a pattern depend on each other, and the epipolar model was chosen among many for them.
+PARALLAX_LOG10_NFA = -5.0
 # Planes are seldom perfect: a match is off the plane beyond this multiple of the threshold.
 OFF_PLANE_FACTOR = 2.0
 # Once H is known, two matches off the plane determine the fundamental matrix.

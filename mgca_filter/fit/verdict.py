@@ -23,8 +23,8 @@ from .choice import Coefficients
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
 from .evidence import MIN_MATCHES, Evidence, distinct_rows
 from .focal_check import better_focal_factor
-from .homography_fit import HomographyOptions, estimate_homography
-from .planarity import MEANINGFUL_LOG10_NFA, find_plane, homography_false_alarms
+from .homography_fit import HomographyOptions, estimate_homography, polish_homography
+from .planarity import MEANINGFUL_LOG10_NFA, find_plane, homography_explains, homography_false_alarms
 from .robust_fit import REFINE_PX, TwoViewModel
 
 Array = NDArray[np.float64]
@@ -34,6 +34,8 @@ _CONTRADICTION_PX, _CONTRADICTION_ITERATIONS = 1.0, 1000
 # A plane in doubt is looked for quickly first, at a generous threshold.
 _QUICK_PLANE_PX = 3.0
 _PLANE_PX = 2.0
+# A plane on which fewer of the inliers lie is one of several of a scene with depth.
+_LEAST_PLANE_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,12 @@ def judge(
         plane = _plane_or(verdict, pair, evidence, mask_threshold_px, options)
         info = {**info, "homography": plane.H} if plane.H is not None else info
         return replace(verdict, status=Status.LOW_SUPPORT, H=plane.H, info=info)
+    verdict = _test_plane(pair, model, evidence, (evidence.rows[witnesses], inlier_rows), support, options, verdict)
     factor = better_focal_factor(fitted, model.R, model.t, threshold) if pair.calibrated else None
     if factor is not None:
-        return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info={**info, "focal_factor": factor})
-    return _test_plane(pair, model, evidence, inlier_rows, support, options, verdict)
+        info = {**verdict.info, "focal_factor": factor}
+        return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS, info=info)
+    return verdict
 
 
 def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: float, options: FilterOptions) -> Verdict:
@@ -130,7 +134,8 @@ def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: flo
     info = {"support": plane.count, "log10_false_alarms": plane.log10_false_alarms}
     if not plane.meaningful:
         return Verdict(Status.UNRELATED, nothing, info=info)
-    return _keep_homography(pair, plane.H, Status.OK, mask_threshold_px, info)
+    H = _polished_on_all(pair, plane.H, options)
+    return _keep_homography(pair, H, Status.OK, mask_threshold_px, info)
 
 
 def count_distinct(correspondences: Array) -> int:
@@ -212,11 +217,14 @@ def _test_rotation(
         return None
     R = degeneracy.fit_rotation(pair.correspondences[fitted_rows[near]], REFINE_PX / pair.focal_px)
     H = pair.intrinsics2.K @ R @ np.linalg.inv(pair.intrinsics1.K)
-    distance_px = homography_distance(*pair.pixels(fitted_rows), H)
+    # Of a zoom both in pixels, whose noise is that of the keypoints in either image.
+    rows = np.hstack(pair.pixels(fitted_rows))
+    distance_px = sampson_distance_to_homography(rows, H)
     if not degeneracy.explains(distance_px, REFINE_PX, support):
         return None
-    epipolar_px = sampson_distance(pair.correspondences[fitted_rows[near]], model.M) * pair.focal_px
-    if pair.calibrated and not degeneracy.prefers_rotation(distance_px[near], epipolar_px):
+    F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
+    # All of them, for those that agree with the model are chosen by how little noise they have along one direction.
+    if pair.calibrated and not degeneracy.prefers_rotation(distance_px, sampson_distance(rows, F)):
         return None
     verdict = _keep_homography(pair, H, Status.PURE_ROTATION, mask_threshold_px, info)
     return replace(verdict, R=R)
@@ -226,24 +234,48 @@ def _test_plane(
     pair: PairInput,
     model: TwoViewModel,
     evidence: Evidence,
-    inlier_rows: NDArray[np.intp],
+    rows: tuple[NDArray[np.intp], NDArray[np.intp]],
     support: degeneracy.Support,
     options: FilterOptions,
     verdict: Verdict,
 ) -> Verdict:
-    """The verdict with the homography that explains the inliers as well, where there is one."""
+    """The verdict with the homography that explains the inliers as well, where there is one.
+
+    It explains nearly all of them; or most, and the others are no more than what an epipolar model, which is free to
+    move about a plane, gathers by accident.
+
+    Args:
+        rows: of the pair's matches those that bear witness, and of these those that agree with the model.
+    """
+    fitted_rows, inlier_rows = rows
     points1, points2 = pair.pixels(inlier_rows)
     if model.plane is not None:
         found = pair.intrinsics2.K @ model.plane @ np.linalg.inv(pair.intrinsics1.K)
-        if not degeneracy.may_explain(homography_distance(points1, points2, found), REFINE_PX, support):
+        distance_px = homography_distance(points1, points2, found)
+        least = degeneracy.CLEAR_SHORTFALL * _LEAST_PLANE_SHARE
+        if not degeneracy.may_explain(distance_px, REFINE_PX, support) and _explained_share(distance_px) < least:
             return verdict
     quick = fit_homography(points1, points2, HOMOGRAPHY_THRESHOLD_FACTOR * REFINE_PX, options.seed)
-    if quick is None or not degeneracy.explains(homography_distance(points1, points2, quick), REFINE_PX, support):
+    if quick is None:
         return verdict
-    H = pair.homography_in_units(_best_homography(pair, evidence, options, quick))
+    distance_px = homography_distance(points1, points2, quick)
+    explained = degeneracy.explains(distance_px, REFINE_PX, support)
+    if not explained and _explained_share(distance_px) < _LEAST_PLANE_SHARE:
+        return verdict
+    H = _best_homography(pair, evidence, options, quick)
+    if not explained:
+        fitted = np.hstack(pair.pixels(fitted_rows))
+        F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
+        if not any(homography_explains(fitted, plane, F, REFINE_PX) for plane in (quick, H)):
+            return verdict
+    H = pair.homography_in_units(H)
     planar = replace(verdict, status=Status.PLANAR, H=H, info={**verdict.info, "homography": H})
     # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
     return planar if pair.calibrated else replace(planar, E=None, R=None, t=None)
+
+
+def _explained_share(distance_px: Array) -> float:
+    return float(np.mean(distance_px < degeneracy.EXPLAINED_THRESHOLD_FACTOR * REFINE_PX))
 
 
 def _plane_or(
@@ -268,7 +300,13 @@ def _best_homography(pair: PairInput, evidence: Evidence, options: FilterOptions
     """The homography (3, 3) of the pixels that the matches support best; ``quick`` where none is found."""
     rows = np.hstack(pair.pixels(evidence.rows))
     fit = estimate_homography(rows, _plane_options(options), evidence.scores)
-    return quick if fit is None else fit.H
+    return quick if fit is None else _polished_on_all(pair, fit.H, options)
+
+
+def _polished_on_all(pair: PairInput, H: Array, options: FilterOptions) -> Array:
+    """``H`` after least squares on all matches that agree with it: also on those that the network did not see, which
+    hardly meet a homography by accident."""
+    return polish_homography(np.hstack(pair.pixels(pair.valid)), H, _plane_options(options))
 
 
 def _plane_options(options: FilterOptions) -> HomographyOptions:

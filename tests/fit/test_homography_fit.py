@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from mgca_filter.fit.homography_fit import FAMILIES, HomographyFit, HomographyOptions, estimate_homography
+from mgca_filter.fit.homography_fit import (
+    FAMILIES,
+    HomographyFit,
+    HomographyOptions,
+    estimate_homography,
+    polish_homography,
+)
 from mgca_filter.fit.planarity import (
     chance_rate,
     find_plane,
@@ -341,3 +347,14 @@ def test_a_plane_is_explained_by_its_homography_and_a_scene_with_depth_is_not() 
     rows, H, F = scene(0.4, 40)
     assert not homography_explains(rows, H, F, 1.0)
     assert parallax_false_alarms(rows, H, F, 1.0) < parallax_false_alarms(*scene(0.4, 15), 1.0)
+
+
+def test_polish_takes_in_matches_that_the_fit_did_not_see() -> None:
+    rows, right = make_matches(right=120, wrong=60)
+    few = estimate_homography(rows[np.flatnonzero(right)[:12]], HomographyOptions(threshold=2.0))
+    exact = cv2.perspectiveTransform(rows[right][None, :, :2], MAPS["homography"])[0]
+    errors = []
+    for H in (few.H, polish_homography(rows, few.H, HomographyOptions(threshold=2.0))):
+        errors.append(np.sqrt(np.mean((cv2.perspectiveTransform(rows[right][None, :, :2], H)[0] - exact) ** 2)))
+    assert errors[1] < errors[0]
+    np.testing.assert_array_equal(polish_homography(rows[:3], few.H), few.H)

@@ -71,6 +71,23 @@ def test_a_standing_camera_only_turns(match_filter: MatchFilter, seed: int) -> N
     assert rms_px(result.H, points1[60:], points2[60:]) < 0.3
 
 
+@pytest.mark.parametrize("noise_px", [0.3, 1.0])
+@pytest.mark.parametrize("zoom", [0.4, 0.6, 1.0, 1.6, 3.0])
+def test_a_zoom_on_the_spot_is_a_rotation(match_filter: MatchFilter, zoom: float, noise_px: float) -> None:
+    rng = np.random.default_rng(1)
+    K2 = K * [[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]
+    R, _ = cv2.Rodrigues(rng.normal(0, 0.03, 3))
+    points1 = rng.uniform((0, 0), SIZE, (6000, 2))
+    points2 = cv2.perspectiveTransform(points1[None], K2 @ R @ np.linalg.inv(K))[0]
+    seen = np.flatnonzero(((points2 > 0) & (points2 < SIZE)).all(axis=1))[:250]
+    ends = [p[seen] + rng.normal(0, noise_px, (len(seen), 2)) for p in (points1, points2)]
+    ends1, ends2 = (np.vstack([p, rng.uniform((0, 0), SIZE, (80, 2))]) for p in ends)
+    ratio = np.concatenate([rng.uniform(0.3, 0.85, len(seen)), rng.uniform(0.7, 1.0, 80)]).astype(np.float32)
+    result = match_filter.filter(ends1, ends2, None, K1=K, K2=K2, attributes=MatchAttributes(ratio=ratio))
+    assert result.status is Status.PURE_ROTATION
+    assert rotation_error_deg(result.R, R) < 0.3
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     ("kind", "status"), [("planar", Status.PLANAR), ("rotation", Status.PURE_ROTATION)], ids=["planar", "rotation"]
