@@ -1,7 +1,8 @@
 """Is the fast model enough? ``python -m benchmarks.published_models FOLDER [FOLDER ...]``.
 
 The filter with each published model on the same lists, of every detector and kind, and what a forward pass costs on one
-thread, in turn. ``--fill`` puts the tables into the fast model's card.
+thread, in turn. ``--fill`` puts the tables into the fast model's card. ``--candidate FILE`` asks the same of a model
+that is not published.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from mgca_filter.errors import DatasetError
+from mgca_filter.evaluation.metrics import percentile_interval
 from mgca_filter.evaluation.our_rows import ProductMethod
 from mgca_filter.evaluation.predict import predict
 from mgca_filter.evaluation.store import ResultStore
@@ -34,9 +36,9 @@ SIZES, REPEATS = (100, 500, 2000), 9
 
 
 def comparisons(
-    scenes: Sequence[DetectorScene], kinds: Sequence[ListKind], store: ResultStore, workers: int
+    scenes: Sequence[DetectorScene], kinds: Sequence[ListKind], store: ResultStore, workers: int, candidate: Path
 ) -> dict[tuple[str, str], Comparison]:
-    """The fast model against the default on the lists of each detector and kind."""
+    """A model file against the default on the lists of each detector and kind."""
     found = {}
     for detector in dict.fromkeys(scene.detector for scene in scenes):
         for kind in kinds:
@@ -45,8 +47,8 @@ def comparisons(
             if not selections:
                 continue
             errors = {}
-            for name, model in ((OURS, FAST), (REFERENCE, REFERENCE)):
-                method = ProductMethod("product", model=str(model_path(model)))
+            for name, model in ((OURS, candidate), (REFERENCE, model_path(REFERENCE))):
+                method = ProductMethod("product", model=str(model))
                 errors[name] = scene_errors(
                     predict([method], selections, store=store, seeds=1, workers=workers)[method.name]
                 )
@@ -55,22 +57,29 @@ def comparisons(
     return found
 
 
-def format_comparisons(found: dict[tuple[str, str], Comparison]) -> str:
+def format_comparisons(found: dict[tuple[str, str], Comparison], candidate: str) -> str:
     """A row a detector and kind of list, and their mean."""
     rows = []
     for (detector, kind), one in found.items():
-        bounds = [one.against(REFERENCE, key) for key in COMPARED]
-        differences = [f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]" for middle, low, high in bounds]
+        differences = [_difference(*one.against(REFERENCE, key)) for key in COMPARED]
         figures = [" / ".join(f"{one.figures[name][key]:.1f}" for key in STATISTICS) for name in (REFERENCE, OURS)]
         rows.append([detector, kind, str(one.lists), *figures, *differences])
     means = [
         " / ".join(f"{np.mean([one.figures[name][key] for one in found.values()]):.1f}" for key in STATISTICS)
         for name in (REFERENCE, OURS)
     ]
-    middles = [f"{np.mean([one.differences[REFERENCE][key] for one in found.values()]):+.1f}" for key in COMPARED]
-    rows.append(["mean", "", str(sum(one.lists for one in found.values())), *means, *middles])
-    header = ["detector", "list", "lists", "default", "fast", *(f"difference in {key}" for key in COMPARED)]
+    differences = []
+    for key in COMPARED:
+        middle = float(np.mean([one.differences[REFERENCE][key] for one in found.values()]))
+        draws = np.mean([one.resampled[REFERENCE][key] for one in found.values()], axis=0)
+        differences.append(_difference(middle, *percentile_interval(draws)))
+    rows.append(["mean", "", str(sum(one.lists for one in found.values())), *means, *differences])
+    header = ["detector", "list", "lists", "default", candidate, *(f"difference in {key}" for key in COMPARED)]
     return render_table(header, rows)
+
+
+def _difference(middle: float, low: float, high: float) -> str:
+    return f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]"
 
 
 def network_ms(backends: dict[str, Backend], count: int) -> dict[str, float]:
@@ -99,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = study_parser("published_models", __doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("bundles", metavar="FOLDER", nargs="+", type=Path, help="folders of scene bundles, or bundles")
+    parser.add_argument("--candidate", type=Path, metavar="FILE", help="a model file in the place of the fast model")
+    parser.add_argument("--scenes", nargs="+", metavar="NAME", help="these alone")
     parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone, as the bundles' names have them")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="of lists (default: all)")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes (default 1)")
@@ -109,12 +120,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Print both tables."""
-    scenes = open_detector_scenes(options.bundles, options.detectors, None, options.per_scene, options.seed, None)
+    if options.fill and options.candidate:
+        raise ValueError("--fill: the card is that of the fast model, not of --candidate")
+    candidate, name = options.candidate or model_path(FAST), options.candidate.stem if options.candidate else FAST
+    scenes = open_detector_scenes(
+        options.bundles, options.detectors, options.scenes, options.per_scene, options.seed, None
+    )
     kinds = [KINDS[name] for name in dict.fromkeys(options.kinds)]
-    found = comparisons(scenes, kinds, ResultStore(options.store), options.workers)
+    found = comparisons(scenes, kinds, ResultStore(options.store), options.workers, candidate)
     if not found:
         raise DatasetError(f"{', '.join(map(str, options.bundles))}: no list of the kinds {', '.join(options.kinds)}")
-    tables = f"{format_comparisons(found)}\n\n{format_times()}"
+    table = format_comparisons(found, name)
+    tables = table if options.candidate else f"{table}\n\n{format_times()}"
     print(tables)
     if options.fill:
         fill_file(model_path(FAST).with_suffix(".md"), {PLACE: f"{tables}\n\n{provenance()}"})
