@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
-from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focals, pose_sigma_deg, share_within_10_deg
+from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focals
 from .fit.mirror import judge_mirror
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, count_distinct, judge, judge_homography
@@ -256,15 +256,6 @@ class MatchFilter:
             verdict = replace(verdict, status=Status.LOW_SUPPORT if verdict.H is None else Status.PLANAR)
         if job.focal is not None and verdict.status is Status.PLANAR:
             verdict = replace(verdict, E=None, R=None, t=None)  # a plane tells no focal length
-        if job.focal is not None and verdict.t is not None:
-            # The confidence takes the focal lengths for known.
-            assert job.model is not None
-            assert job.model.confidence is not None
-            share = share_within_10_deg(pose_sigma_deg(job.evidence, job.model, job.focal))
-            confidence = share * job.model.confidence
-            job.model = replace(job.model, confidence=confidence)
-            if verdict.status is Status.OK and confidence < choice["verdict"][1]:
-                verdict = replace(verdict, status=Status.LOW_SUPPORT)
         if not job.given and job.focal is None and options.geometry == "auto" and verdict.t is not None:
             verdict = replace(verdict, E=None, R=None, t=None)  # nor do matches that no focal length explains
         verdict = judge_mirror(pair, job.evidence, verdict, threshold_px, options)

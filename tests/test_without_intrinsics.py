@@ -70,24 +70,6 @@ def test_a_guess_that_nothing_bears_out_gives_no_pose(
     assert run(match_filter, scene, K1=K).E is not None
 
 
-def test_the_confidence_falls_with_that_of_the_focal_lengths(
-    match_filter: MatchFilter, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = make_scene("skew", right=300, wrong=60)
-    right = K[0, 0] / (1.2 * SIZE[0])
-    results = []
-    for sigma in (0.02, 2.0):
-        estimates = [FocalEstimate((right, right), (sigma, sigma))]
-        monkeypatch.setattr(match_filter_module, "estimate_focals", lambda *arguments, e=estimates: e)
-        results.append(run(match_filter, scene))
-    sure, unsure = results
-    assert sure.status is Status.OK
-    assert unsure.status is Status.LOW_SUPPORT
-    assert unsure.confidence < sure.confidence
-    np.testing.assert_array_equal(unsure.R, sure.R)
-    np.testing.assert_array_equal(unsure.mask, sure.mask)
-
-
 def test_where_two_focal_lengths_fail_one_is_tried(match_filter: MatchFilter, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = make_scene("skew", right=300, wrong=60)
     right = K[0, 0] / (1.2 * SIZE[0])

@@ -395,7 +395,6 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     set(Feature::log_matches, std::log(all + 1.0));
     set(Feature::log_sum_of_scores, std::log(sum_of_weights + 1.0));
     set(Feature::log_uncertainty_deg, std::log(spread));
-    set(Feature::mean_score, weighted / std::max(number, 1.0));
     return judgement;
 }
 

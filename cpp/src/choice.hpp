@@ -40,7 +40,6 @@ enum class Feature : std::size_t {
     log_matches,
     log_sum_of_scores,
     log_uncertainty_deg,
-    mean_score,
     count,  // number of the above
 };
 constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);

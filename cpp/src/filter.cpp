@@ -290,14 +290,6 @@ Result Filter::operator()(const MatchPair& matches) const {
             verdict.R.reset();
             verdict.t.reset();
         }
-        if (focal && verdict.t) {
-            // The confidence takes the focal lengths for known.
-            const double sigma_deg = detail::pose_sigma_deg(*evidence, *model, *focal);
-            model->confidence = *model->confidence * detail::share_within_10_deg(sigma_deg);
-            if (verdict.status == Status::ok && *model->confidence < metadata.choice.verdict[1]) {
-                verdict.status = Status::low_support;
-            }
-        }
         if (!given && !focal && options_.geometry == Geometry::automatic && verdict.t) {
             verdict.E.reset();  // nor do matches that no focal length explains
             verdict.R.reset();

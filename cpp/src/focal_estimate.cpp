@@ -107,18 +107,6 @@ std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorG
     return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma), 0.0}, best};
 }
 
-/// Of the logarithms of the factors. Where both images share one, either may be off by as much as the ratio is open, the
-/// one up, the other down: that they share it is an assumption, whose errors are larger than those of noise.
-cv::Matx22d covariance(const FocalEstimate& estimate) {
-    const double first = estimate.sigmas[0], second = estimate.sigmas[1], both = first * second;
-    const double squared = std::pow(std::min(estimate.ratio_sigma, kLargestRatioSigma), 2);
-    if (estimate.factors[0] == estimate.factors[1]) {
-        return {both + squared, both - squared, both - squared, both + squared};
-    }
-    const double mixed = std::clamp(0.5 * (first * first + second * second - squared), -both, both);
-    return {first * first, mixed, mixed, second * second};
-}
-
 }  // namespace
 
 std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::Matx33d& F) {
@@ -162,28 +150,6 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
         estimates.push_back({shared->factors, shared->sigmas, ratio_sigma});
     }
     return estimates;
-}
-
-double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const FocalEstimate& estimate) {
-    const Correspondences rows = agreeing_with(evidence, model.M);
-    if (rows.size() < kMinRows) {
-        return 180.0;
-    }
-    const cv::Matx<double, 5, 2> derivative = FocalPairFit(rows, kInfinity, 1.0, {0.0, 1.0}).pose_derivative(model.pose);
-    const cv::Matx<double, 5, 5> moved = derivative * covariance(estimate) * derivative.t();
-    double variance = 0.0;
-    const auto add = [&](const cv::Mat& part) {
-        cv::Mat values;
-        cv::eigen(part, values);
-        variance = std::max(variance, values.at<double>(0));
-    };
-    add(cv::Mat(moved.get_minor<3, 3>(0, 0)));
-    add(cv::Mat(moved.get_minor<2, 2>(3, 3)));
-    return std::min(std::sqrt(variance) * 180.0 / CV_PI, 180.0);
-}
-
-double share_within_10_deg(double sigma_deg) {
-    return 1.0 - std::exp(-0.5 * std::pow(10.0 / std::max(sigma_deg, 1e-3), 2));
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -311,7 +311,7 @@ Coefficients coefficients() {
         "noise_scales": [1.0, 1.7], "outlier_width_px": [300], "seen_behind": [0.02],
         "support_weight": [0.1], "crowding": [0.15, 0.5], "early_end": [0.5, 50, 0.03, 0.5, 20],
         "settled": [1, 0.95, 0.05], "verdict": [0.1, 0.5],
-        "confidence": [1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0], "early_confidence": [0,0,0,0,0,0,1]})"));
+        "confidence": [1,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0,0], "early_confidence": [0,0,0,0,0,0,1]})"));
 }
 
 void the_likelier_hypothesis_is_chosen() {
@@ -327,7 +327,6 @@ void the_likelier_hypothesis_is_chosen() {
     check::equal(judged.chosen, std::size_t{1}, "the true pose");
     check::that(judged[Feature::likelihood_to_alternative] > 3.0, "far from its alternative");
     check::near(judged[Feature::no_network], 1.0, 0.0, "no network E");
-    check::near(judged[Feature::mean_score], 0.9, 0.02, "the inliers' scores");
     check::equal(judge_hypotheses(matches, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
                  "without scores as well");
     // Confidence is the logistic function of the weighted features.

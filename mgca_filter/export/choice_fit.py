@@ -47,7 +47,7 @@ FOLDS = 5
 KINDS = ("raw", "cross", "ratio", "cross and ratio")
 PLAIN_RATIO = 0.75
 # "ok" is said from the confidence on at which this share is right, and nothing below the second, which is chance's.
-OK_PRECISION, LEAST_CONFIDENCE = 0.95, 0.07
+OK_PRECISION, LEAST_CONFIDENCE = 0.96, 0.1
 # Of the pairs of one place without overlap this share may pass for "ok".
 APART_OK = 0.05
 # Of the poses that the bundles of a scene vouch for, so many of the easy ones agree with them (``QUALITY.csv``).

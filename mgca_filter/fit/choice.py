@@ -60,7 +60,7 @@ FEATURES = (
     *("plain likelihood to best", "weighted support to best", "share behind"),
     *("near network E 3 deg", "near network E 10 deg", "no network E"),
     *(f"other families within {angle:g} deg" for angle in AGREEMENT_DEG),
-    *("log scale", "log matches", "log sum of scores", "log uncertainty deg", "mean score"),
+    *("log scale", "log matches", "log sum of scores", "log uncertainty deg"),
 )
 """Measurements of the chosen hypothesis, in the order of ``coefficients["confidence"]``, which ends in the offset."""
 
@@ -350,7 +350,6 @@ def judge(
         "log matches": np.log(count + 1.0),
         "log sum of scores": np.log(weights.sum() + 1.0),
         "log uncertainty deg": np.log(spread),
-        "mean score": weighted / max(number, 1.0),
     }
     distances = np.where(front[chosen], distance[chosen], np.inf)
     return Judgement(chosen, {k: float(v) for k, v in features.items()}, likelihood, distances, share, scale)

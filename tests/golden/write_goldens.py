@@ -240,8 +240,8 @@ def cases(inputs: Sequence[GoldenInput]) -> list[Case]:
         Case("guessed_fundamental", "guessed_by_size", {"geometry": "fundamental"}),
         Case("general_full", "general", {"effort": "full"}),
         Case("general_threshold", "general", {"threshold": 0.4}),
-        Case("guessed_magsac", "guessed_by_extent", {"method": "magsac"}),
-        Case("guessed_ransac", "guessed_by_extent", {"method": "ransac"}),
+        Case("guessed_magsac", "guessed_by_size", {"method": "magsac"}),
+        Case("guessed_ransac", "guessed_by_size", {"method": "ransac"}),
         Case("courtyard_full", "courtyard", {"effort": "full"}),
     ]
 
