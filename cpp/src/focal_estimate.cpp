@@ -21,8 +21,6 @@ constexpr double kUsual = -0.3, kUsualSpread = 0.35;
 constexpr double kThresholdPx = 2.0;
 // What makes of the curvature a standard deviation that two thirds of the training pairs keep.
 constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
-// Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
-constexpr double kLargestRatioSigma = 0.5;
 // Under a focal length far from the right one matches lie this far off before the pose is refined.
 constexpr double kReachPx = 16.0;
 constexpr int kRounds = 6;

@@ -28,7 +28,6 @@ _USUAL, _USUAL_SPREAD = -0.3, 0.35
 _THRESHOLD_PX = 2.0
 # What makes of the curvature a standard deviation that two thirds of the training pairs keep.
 _SIGMA_FACTOR, _LEAST_SIGMA = 3.0, 0.04
-# Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
 # Under a focal length far from the right one matches lie this far off before the pose is refined.
 _REACH_PX = 16.0
 _ROUNDS = 6
