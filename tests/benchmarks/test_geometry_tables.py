@@ -56,7 +56,7 @@ def test_made_up_pairs_obey_their_cameras(zoom: float) -> None:
 
 
 def test_a_row_without_intrinsics(match_filter: MatchFilter) -> None:
-    pair = without_intrinsics.make_pair(3, 1.6)
+    pair = without_intrinsics.make_pair(4, 1.6)
     free = MatchFilter.over(
         match_filter._backend, without_intrinsics.replace(match_filter.options, geometry="fundamental")
     )
