@@ -141,6 +141,13 @@ def _shown(one: Photograph, part: Rectangle, depths: Depths, two: Photograph) ->
     return np.asarray((X - one.camera.t) @ one.camera.R)
 
 
+def _inside(pixels: Array, photograph: Photograph) -> NDArray[np.bool_]:
+    """Which pixels (N, 2) may be in a photograph; NaN are not."""
+    margin = _MARGIN * max(photograph.size)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((pixels > -margin) & (pixels < np.array(photograph.size) + margin)).all(axis=1))
+
+
 def are_apart(one: Photograph, two: Photograph) -> bool:
     """Whether it is certain that no point within the depths of both photographs is in both."""
     for here, there in ((one, two), (two, one)):
@@ -148,10 +155,7 @@ def are_apart(one: Photograph, two: Photograph) -> bool:
         if shown is None:
             return False
         pixels, depth = _project(shown, there)
-        margin = _MARGIN * max(there.size)
-        with np.errstate(invalid="ignore"):
-            inside = ((pixels > -margin) & (pixels < np.array(there.size) + margin)).all(axis=1)
-        if (inside & (depth > there.depths.near) & (depth < there.depths.far)).any():
+        if (_inside(pixels, there) & (depth > there.depths.near) & (depth < there.depths.far)).any():
             return False
     return True
 
@@ -172,9 +176,7 @@ def parts_apart(one: Photograph, two: Photograph) -> tuple[Rectangle, Rectangle]
                     return None
                 pixels, _ = _project(shown, two)
                 margin = _MARGIN * max(two.size)
-                with np.errstate(invalid="ignore"):
-                    near = ((pixels > -margin) & (pixels < np.array(two.size) + margin)).all(axis=1)
-                place = pixels[near, axis]
+                place = pixels[_inside(pixels, two), axis]
                 for low in (True, False):
                     length = two.size[axis]
                     edge = place.min(initial=length + margin) - margin if low else place.max(initial=-margin) + margin

@@ -8,7 +8,7 @@ surely. Where one focal length leaves more than two would, the images are of two
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,12 +46,10 @@ class FocalEstimate:
     Attributes:
         factors: on the guessed ones, of image 1 and 2; equal where both images share the factor.
         sigmas: standard deviations of their logarithms: 0.1 is ten per cent.
-        ratio_sigma: the same of their ratio; where both images share the factor, how surely they do.
     """
 
     factors: tuple[float, float]
     sigmas: tuple[float, float]
-    ratio_sigma: float = 0.0
 
     @property
     def shared(self) -> bool:
@@ -87,12 +85,11 @@ def estimate_focals(evidence: Evidence, F: Array) -> list[FocalEstimate]:
     if trial.R is not None and trial.t is not None and np.isfinite(trial.cost_px):
         noise_px = max(float(np.sqrt(np.mean(distance_px[near] ** 2))), _LEAST_NOISE_PX)
         fit = FocalPairFit(rows, _THRESHOLD_PX / focal_px, noise_px / focal_px, FocalBelief(_USUAL, _USUAL_SPREAD))
-        two, ratio_sigma = fit.differing(trial.R, trial.t, float(np.log(_FACTORS[best])))
-        estimates = [replace(estimate, ratio_sigma=ratio_sigma) for estimate in estimates]
+        two = fit.differing(trial.R, trial.t, float(np.log(_FACTORS[best])))
         if two is not None:
             first, second = (float(factor) for factor in np.exp(two.logs))
             sigma1, sigma2 = (float(sigma) for sigma in np.hypot(two.sigmas, _LEAST_SIGMA))
-            estimates.insert(0, FocalEstimate((first, second), (sigma1, sigma2), two.ratio_sigma))
+            estimates.insert(0, FocalEstimate((first, second), (sigma1, sigma2)))
     return estimates
 
 
