@@ -102,7 +102,7 @@ std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorG
     const double log_factor = std::clamp(logs[best] - slope / (2.0 * curvature), logs[best - 1], logs[best + 1]);
     // A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
     const double sigma = std::hypot(kSigmaFactor / std::sqrt(curvature), kLeastSigma);
-    return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma), 0.0}, best};
+    return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma)}, best};
 }
 
 }  // namespace
@@ -127,7 +127,6 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
     }
     const auto [shared, best] = shared_factor(logs, costs, rows.size());
     std::vector<FocalEstimate> estimates;
-    double ratio_sigma = 0.0;
     if (trials[best].pose && std::isfinite(costs[best])) {
         double sum = 0.0;
         for (const double distance : sampson_distances(agreeing, F)) {
@@ -136,16 +135,13 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
         const double noise =
             std::max(std::sqrt(sum / static_cast<double>(agreeing.size())), kBestNoisePx / evidence.focal_px);
         const FocalPairFit fit(rows, kThresholdPx / evidence.focal_px, noise, {kUsual, kUsualSpread});
-        const auto [two, sigma_beside] = fit.differing(*trials[best].pose, logs[best]);
-        ratio_sigma = sigma_beside;
-        if (two) {
+        if (const auto two = fit.differing(*trials[best].pose, logs[best])) {
             estimates.push_back({{std::exp(two->logs[0]), std::exp(two->logs[1])},
-                                 {std::hypot(two->sigmas[0], kLeastSigma), std::hypot(two->sigmas[1], kLeastSigma)},
-                                 two->ratio_sigma});
+                                 {std::hypot(two->sigmas[0], kLeastSigma), std::hypot(two->sigmas[1], kLeastSigma)}});
         }
     }
     if (shared) {
-        estimates.push_back({shared->factors, shared->sigmas, ratio_sigma});
+        estimates.push_back(*shared);
     }
     return estimates;
 }

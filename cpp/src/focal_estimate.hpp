@@ -14,7 +14,6 @@ namespace mgca::detail {
 struct FocalEstimate {
     cv::Vec2d factors;  // on the guessed ones, of image 1 and 2; equal where both images share the factor
     cv::Vec2d sigmas;   // standard deviations of their logarithms: 0.1 is ten per cent
-    double ratio_sigma = 0.0;  // the same of their ratio; where both images share the factor, how surely they do
 };
 
 /// The focal lengths under which the matches agree best with a pose, the most plausible first: two different factors

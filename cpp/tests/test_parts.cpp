@@ -231,7 +231,7 @@ void two_focal_lengths_are_found_where_they_differ() {
     const Pose skew{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.6, 0.5))};
     const FocalBelief belief{-0.3, 0.35};
     const auto found = [&](const Correspondences& rows, const Pose& pose, double start, double noise_px) {
-        return FocalPairFit(rows, 2.0 / kFocal, noise_px / kFocal, belief).differing(pose, start).first;
+        return FocalPairFit(rows, 2.0 / kFocal, noise_px / kFocal, belief).differing(pose, start);
     };
     for (const double zoom : {0.5, 0.75, 1.3, 2.0}) {
         const double start = std::log(0.8 * std::sqrt(zoom));
