@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .fit.evidence import MIN_MATCHES, Evidence, gather_before, gather_scored
+from .fit.evidence import FIRM_MATCHES, Evidence, gather_before, gather_scored
 from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focals
 from .fit.mirror import judge_mirror
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
-from .fit.verdict import Verdict, count_distinct, judge, judge_homography
+from .fit.verdict import Verdict, judge, judge_homography, too_few
 from .geometry.cameras import Fisheye, mean_focal_length
 from .geometry.epipolar import project_to_essential
 from .inference import BACKENDS, Backend, ModelMetadata, shared_backend
@@ -523,9 +523,9 @@ def _shared_intrinsics(K: MatrixLike | None, K1: MatrixLike | None, K2: MatrixLi
 
 def _verdict_by_scores(pair: PairInput, kept: NDArray[np.bool_]) -> Verdict:
     """Answer without a robust fit: the mask is the network's opinion, and there is no geometry to judge."""
-    if count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+    if too_few(pair):
         return Verdict(Status.TOO_FEW_MATCHES, np.zeros_like(kept))
-    return Verdict(Status.OK if np.count_nonzero(kept) >= MIN_MATCHES else Status.LOW_SUPPORT, kept)
+    return Verdict(Status.OK if np.count_nonzero(kept) >= FIRM_MATCHES else Status.LOW_SUPPORT, kept)
 
 
 def _milliseconds_since(started: float) -> float:

@@ -51,7 +51,7 @@ _TEXTS = {
     "too_few_matches": (
         BAD,
         "There are too few matches to say anything.",
-        "At least eight different ones are needed. " + _MORE_MATCHES,
+        "At least six different ones are needed, eight without intrinsics. " + _MORE_MATCHES,
     ),
 }  # fmt: skip
 _GUESSED = (

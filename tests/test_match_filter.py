@@ -561,3 +561,24 @@ def test_two_keypoints_and_more_of_one_match_are_one_witness(match_filter: Match
     np.testing.assert_array_equal(many.E, one.E)
     assert many.confidence == one.confidence
     np.testing.assert_array_equal(many.mask, np.repeat(one.mask, 4))
+
+
+@pytest.mark.parametrize("count", [6, 7])
+def test_hardly_more_matches_than_a_pose_takes_are_an_answer_to_doubt(model_file: Path, count: int) -> None:
+    near = 0
+    for seed in range(10):
+        scene = make_scene(right=count, wrong=0, seed=seed)
+        result = run(scene, model_file)
+        assert result.status in (Status.LOW_SUPPORT, Status.NO_GEOMETRY)  # never ok
+        if result.t is not None:
+            near += pose_error_deg(result.R, result.t, scene.R, scene.t) < 10.0
+            np.testing.assert_array_equal(result.mask, sampson_distance(np.hstack([scene.points1, scene.points2]), result.F) < 1.0)
+    assert near >= 7
+
+
+def test_as_few_inliers_of_a_longer_list_are_none(model_file: Path) -> None:
+    for seed in range(10):
+        scene = make_scene(right=0, wrong=16, seed=seed)
+        result = run(scene, model_file)
+        assert result.t is None
+        assert not result.mask.any()

@@ -177,7 +177,7 @@ Mask listed_rows(const std::vector<EncodedAttributes>& attributes, const Mask& v
         kept[i] = valid[i] != 0 && !lost && !ambiguous;
         count += kept[i];
     }
-    return raw && count >= kMinMatches ? kept : valid;
+    return raw && count >= kFirmMatches ? kept : valid;
 }
 
 Rows distinct_rows(const Correspondences& matches) {

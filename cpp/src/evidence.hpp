@@ -14,7 +14,9 @@ namespace mgca::detail {
 
 using Rows = std::vector<std::size_t>;
 
-constexpr std::size_t kMinMatches = 8;
+// A pose has five degrees of freedom: the sixth match is the first that bears it out. With so many as the second number
+// a fundamental matrix can be told as well, and inliers are enough however long the list is.
+constexpr std::size_t kMinMatches = 6, kFirmMatches = 8;
 // Matches that the network gives this probability are accepted; with fewer than so many the best-scored stand in.
 constexpr double kAcceptedScore = 0.3;
 constexpr std::size_t kMinAccepted = 32;

@@ -33,7 +33,7 @@ Verdict judge_mirror(const PairInput& pair, const Evidence& evidence, Verdict ve
             matches.push_back(pair.pixels(evidence.correspondences[position]));
         }
     }
-    if (verdict.status == Status::pure_rotation || matches.size() < kMinMatches) {
+    if (verdict.status == Status::pure_rotation || matches.size() < kFirmMatches) {
         return verdict;
     }
     const double turned = share_of_turned_triangles(matches);

@@ -20,6 +20,8 @@ constexpr int kFundamentalIterations = 1000;
 constexpr double kQuickPlanePx = 3.0, kPlanePx = 2.0;
 // A plane on which fewer of the inliers lie is one of several of a scene with depth.
 constexpr double kLeastPlaneShare = 0.7;
+// Inliers that are hardly more than a pose takes must be this share of the list, which else holds as many by chance.
+constexpr double kFewShare = 2.0 / 3.0;
 
 Correspondences valid_matches(const PairInput& pair) {
     Correspondences valid;
@@ -29,6 +31,11 @@ Correspondences valid_matches(const PairInput& pair) {
         }
     }
     return valid;
+}
+
+/// True where the distinct matches are fewer than a pose takes, or, without intrinsics, a fundamental matrix.
+bool too_few(const PairInput& pair) {
+    return distinct_rows(valid_matches(pair)).size() < (pair.calibrated() ? kMinMatches : kFirmMatches);
 }
 
 Correspondences in_pixels(const PairInput& pair, const Correspondences& matches) {
@@ -257,7 +264,7 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
               double mask_threshold_px, const Coefficients& coefficients, const Options& options) {
     Verdict verdict;
     verdict.mask.assign(pair.valid.size(), 0);
-    if (distinct_rows(valid_matches(pair)).size() < kMinMatches) {
+    if (too_few(pair)) {
         verdict.status = Status::too_few_matches;
         return verdict;
     }
@@ -267,12 +274,14 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
     const double threshold = kRefinePx / pair.focal_px();
     Rows witnesses = evidence.above(0.0);
     Rows near = near_rows(evidence, witnesses, model->M, threshold);
-    if (near.size() < kMinMatches) {
+    if (near.size() < kFirmMatches) {
         witnesses.resize(evidence.size());
         std::iota(witnesses.begin(), witnesses.end(), std::size_t{0});
         near = near_rows(evidence, witnesses, model->M, threshold);
     }
-    if (near.size() < kMinMatches) {
+    const bool doubted =
+        !pair.calibrated() || static_cast<double>(near.size()) < kFewShare * static_cast<double>(witnesses.size());
+    if (near.size() < (doubted ? kFirmMatches : kMinMatches)) {
         return plane_or(verdict, pair, evidence, mask_threshold_px, options);
     }
     const Correspondences fitted = evidence.take(witnesses), inliers = evidence.take(near);
@@ -287,7 +296,8 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
         return verdict;
     }
     const bool suspicious = contradicts_intrinsics(pair, fitted, support, options);
-    const auto [withheld, doubtful] = doubts(*model, support, weak, coefficients);
+    auto [withheld, doubtful] = doubts(*model, support, weak, coefficients);
+    doubtful = doubtful || near.size() < kFirmMatches;
     if (withheld && !suspicious) {
         verdict.status = Status::unrelated;
         return plane_or(verdict, pair, evidence, mask_threshold_px, options);
@@ -347,13 +357,13 @@ Verdict judge_homography(const PairInput& pair, const Evidence& evidence, double
 
 Verdict verdict_by_scores(const PairInput& pair, Mask kept) {
     Verdict verdict;
-    if (distinct_rows(valid_matches(pair)).size() < kMinMatches) {
+    if (too_few(pair)) {
         verdict.status = Status::too_few_matches;
         verdict.mask.assign(kept.size(), 0);
         return verdict;
     }
     const auto count = static_cast<std::size_t>(std::count(kept.begin(), kept.end(), 1));
-    verdict.status = count >= kMinMatches ? Status::ok : Status::low_support;
+    verdict.status = count >= kFirmMatches ? Status::ok : Status::low_support;
     verdict.mask = std::move(kept);
     return verdict;
 }

@@ -13,7 +13,9 @@ from ..inputs.pair import PairInput
 
 Array = NDArray[np.float64]
 
-MIN_MATCHES = 8
+# A pose has five degrees of freedom: the sixth match is the first that bears it out. With so many as the second number
+# a fundamental matrix can be told as well, and inliers are enough however long the list is.
+MIN_MATCHES, FIRM_MATCHES = 6, 8
 # Matches that the network gives this probability are accepted; with fewer than so many the best-scored stand in.
 ACCEPTED_SCORE, MIN_ACCEPTED = 0.3, 32
 # Of a raw list, where several matches reach for one keypoint, classical pipelines keep the best with a ratio below.
@@ -137,7 +139,7 @@ def listed_rows(attributes: NDArray[np.float32], valid: NDArray[np.bool_]) -> ND
         return valid
     ambiguous = (attributes[:, Column.RATIO_KNOWN] > 0) & (attributes[:, Column.RATIO] >= RAW_MAX_RATIO)
     kept = valid & ~lost & ~ambiguous
-    return kept if np.count_nonzero(kept) >= MIN_MATCHES else valid
+    return kept if np.count_nonzero(kept) >= FIRM_MATCHES else valid
 
 
 def match_order(

@@ -16,7 +16,7 @@ from ..geometry.homography import sampson_distance_to_homography
 from ..inputs.options import FilterOptions
 from ..inputs.pair import PairInput
 from ..result import Status
-from .evidence import MIN_MATCHES, Evidence
+from .evidence import FIRM_MATCHES, Evidence
 from .homography_fit import HomographyOptions, estimate_homography
 from .planarity import MEANINGFUL_LOG10_NFA, homography_false_alarms
 from .verdict import Verdict
@@ -51,7 +51,7 @@ def judge_mirror(
     if verdict.R is not None:
         rows = rows[verdict.mask[rows]]
     matches = np.hstack(pair.pixels(rows))
-    if verdict.status is Status.PURE_ROTATION or len(matches) < MIN_MATCHES:
+    if verdict.status is Status.PURE_ROTATION or len(matches) < FIRM_MATCHES:
         return verdict
     turned = share_of_turned_triangles(matches)
     if turned < _TURNED_PLANE:

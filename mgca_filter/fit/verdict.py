@@ -21,7 +21,7 @@ from ..result import Status
 from . import degeneracy
 from .choice import Coefficients
 from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipolar, fit_homography
-from .evidence import MIN_MATCHES, Evidence, distinct_rows
+from .evidence import FIRM_MATCHES, MIN_MATCHES, Evidence, distinct_rows
 from .focal_check import better_focal_factor
 from .homography_fit import HomographyOptions, estimate_homography, polish_homography
 from .planarity import MEANINGFUL_LOG10_NFA, find_plane, homography_explains, homography_false_alarms
@@ -36,6 +36,8 @@ _QUICK_PLANE_PX = 3.0
 _PLANE_PX = 2.0
 # A plane on which fewer of the inliers lie is one of several of a scene with depth.
 _LEAST_PLANE_SHARE = 0.7
+# Inliers that are hardly more than a pose takes must be this share of the list, which else holds as many by chance.
+_FEW_SHARE = 2.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -71,19 +73,20 @@ def judge(
         options: confidence and seed of the robust fits that the tests of degeneracy need.
     """
     nothing = np.zeros(len(pair.valid), dtype=bool)
-    if len(evidence) < MIN_MATCHES and count_distinct(pair.correspondences[pair.valid]) < MIN_MATCHES:
+    if len(evidence) < FIRM_MATCHES and too_few(pair):
         return Verdict(Status.TOO_FEW_MATCHES, nothing)
     if model is None:
         return Verdict(Status.NO_GEOMETRY, nothing)
     threshold = REFINE_PX / pair.focal_px
     witnesses = evidence.above(0.0)
     near = sampson_distance(evidence.correspondences[witnesses], model.M) < threshold
-    if np.count_nonzero(near) < MIN_MATCHES:
+    if np.count_nonzero(near) < FIRM_MATCHES:
         witnesses = np.arange(len(evidence))
         near = sampson_distance(evidence.correspondences, model.M) < threshold
     fitted = evidence.correspondences[witnesses]
     inlier_rows, inliers = evidence.rows[witnesses[near]], fitted[near]
-    if len(inliers) < MIN_MATCHES:
+    doubted = not pair.calibrated or len(inliers) < _FEW_SHARE * len(fitted)
+    if len(inliers) < (FIRM_MATCHES if doubted else MIN_MATCHES):
         return _plane_or(Verdict(Status.NO_GEOMETRY, nothing), pair, evidence, mask_threshold_px, options)
     support = degeneracy.measure_support(fitted, model.M, threshold)
     for part in (inliers[:, :2], inliers[:, 2:]):
@@ -98,6 +101,7 @@ def judge(
             return turned
     suspicious = _contradicts_intrinsics(pair, fitted, support, options)
     withheld, doubtful = _doubts(model, support, weak, coefficients)
+    doubtful = doubtful or len(inliers) < FIRM_MATCHES
     if withheld and not suspicious:
         unrelated = Verdict(Status.UNRELATED, nothing, info=info)
         return _plane_or(unrelated, pair, evidence, mask_threshold_px, options)
@@ -136,6 +140,11 @@ def judge_homography(pair: PairInput, evidence: Evidence, mask_threshold_px: flo
         return Verdict(Status.UNRELATED, nothing, info=info)
     H = _polished_on_all(pair, plane.H, options)
     return _keep_homography(pair, H, Status.OK, mask_threshold_px, info)
+
+
+def too_few(pair: PairInput) -> bool:
+    """True where the distinct matches are fewer than a pose takes, or, without intrinsics, a fundamental matrix."""
+    return count_distinct(pair.correspondences[pair.valid]) < (MIN_MATCHES if pair.calibrated else FIRM_MATCHES)
 
 
 def count_distinct(correspondences: Array) -> int:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mgca_filter.fit.evidence import (
     MIN_ACCEPTED,
-    MIN_MATCHES,
+    FIRM_MATCHES,
     RAW_MAX_RATIO,
     distinct_rows,
     first_of_each,
@@ -127,7 +127,7 @@ def test_a_filtered_list_counts_whole_and_a_raw_one_where_it_is_clear(scene: Sce
 
 def test_a_raw_list_of_which_too_little_is_left_counts_whole(scene: Scene) -> None:
     best = np.zeros(200, dtype=bool)
-    for left, expected in ((MIN_MATCHES - 1, 200), (MIN_MATCHES, MIN_MATCHES)):
+    for left, expected in ((FIRM_MATCHES - 1, 200), (FIRM_MATCHES, FIRM_MATCHES)):
         best[np.argsort(scene.attributes.ratio)[:left]] = True
         pair = prepared(replace(scene, attributes=replace(scene.attributes, best=best)))
         assert np.count_nonzero(listed_rows(pair.attributes, pair.valid)) == expected

@@ -13,6 +13,7 @@ from fit_inputs import COEFFICIENTS, before, joined, plane_with_twin, prepared
 
 from mgca_filter import FilterResult, MatchAttributes, MatchFilter, Status
 from mgca_filter.fit import verdict as verdict_module
+from mgca_filter.fit.evidence import MIN_MATCHES
 from mgca_filter.fit.robust_fit import Search
 from mgca_filter.fit.verdict import judge
 from mgca_filter.geometry.epipolar import pose_error_deg, rotation_error_deg, sampson_distance
@@ -216,5 +217,5 @@ def test_nothing_to_judge() -> None:
     pair, evidence = prepared(scene), before(scene)
     options = FilterOptions()
     assert judge(pair, None, evidence, 1.0, COEFFICIENTS, options).status is Status.NO_GEOMETRY
-    few = make_scene(right=7, wrong=0)
+    few = make_scene(right=MIN_MATCHES - 1, wrong=0)
     assert judge(prepared(few), None, before(few), 1.0, COEFFICIENTS, options).status is Status.TOO_FEW_MATCHES

@@ -148,6 +148,7 @@ def synthetic_inputs() -> list[GoldenInput]:
         change(knn, "repeated", matches=[*rows, *rows[:60]]),
         change(knn, "raw_list", matches=ambiguous),
         change(knn, "seven", matches=rows[:7]),
+        from_scene("seven_right", make_scene("wide", 7, 0), **camera),
         change(knn, "empty", matches=[]),
         change(unlisted, "all_equal", keypoints1=[[100.0, 100.0]] * len(ratio), keypoints2=[[90.0, 80.0]] * len(ratio)),
         normalised("normalised", general),

@@ -58,7 +58,7 @@ public:
 /// Verdict on a pair of images; only `ok` and `planar` come with a pose that can be used as it is.
 enum class Status {
     ok,                     ///< The geometry stands on firm ground.
-    too_few_matches,        ///< Fewer than eight distinct matches: nothing was tried.
+    too_few_matches,        ///< Fewer than six distinct matches, without intrinsics than eight: nothing was tried.
     no_geometry,            ///< No model was found, or the inliers lie on a line.
     low_support,            ///< A model was found and is doubtful.
     unrelated,              ///< What was found is chance: the images do not show the same scene.
