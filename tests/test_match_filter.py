@@ -572,7 +572,9 @@ def test_hardly_more_matches_than_a_pose_takes_are_an_answer_to_doubt(model_file
         assert result.status in (Status.LOW_SUPPORT, Status.NO_GEOMETRY)  # never ok
         if result.t is not None:
             near += pose_error_deg(result.R, result.t, scene.R, scene.t) < 10.0
-            np.testing.assert_array_equal(result.mask, sampson_distance(np.hstack([scene.points1, scene.points2]), result.F) < 1.0)
+            np.testing.assert_array_equal(
+                result.mask, sampson_distance(np.hstack([scene.points1, scene.points2]), result.F) < 1.0
+            )
     assert near >= 7
 
 
