@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mgca_filter.fit.evidence import (
-    MIN_ACCEPTED,
     FIRM_MATCHES,
+    MIN_ACCEPTED,
     RAW_MAX_RATIO,
     distinct_rows,
     first_of_each,
