@@ -8,6 +8,10 @@ runs, on the same pairs and on one thread; times are CPU time.
 (``scene.aliked_lightglue.npz``) or a learned detector's mutual nearest neighbours, before PoseLib and before the
 filter. Every row then stands on the pairs that all of these bundles hold, and differences are to the first of these
 rows. The time that it took to find these matches is not known here.
+
+``rows=second`` and ``rows=backward`` in a setting hand over more than ``match_images`` does: the second neighbours of
+ambiguous matches, or what the keypoints of image 2 find in image 1. ``--shrink`` makes the photographs smaller, so that
+fewer keypoints are found and right.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence, Set
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, TypeVar
 
 import cv2
@@ -47,16 +52,23 @@ from mgca_filter.features import (
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.tables import MISSING, markdown_head, markdown_row
 
+from .detectors import rendered
 from .match_lists import KINDS, DetectorScene, open_detector_scenes
 from .study import paired_cells, run_study, study_parser
 
 Array = NDArray[np.float64]
+Matches = tuple[tuple[cv2.DMatch, ...], ...]
 T = TypeVar("T")
 
 STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
 SETTING = "DETECTOR-COUNT[:OPTION=VALUE,...]"
 FILTER_OPTIONS = ("effort", "geometry", "method", "model")
 """Options of the filter that a setting may name."""
+CAMERA_COLUMNS = ("fx", "fy", "cx", "cy", "k1", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
+ROWS = ("second", "backward")
+"""Matches that a setting may add to those of ``match_images``, by ``rows=``."""
+AMBIGUOUS_RATIO, SECOND_RATIO = 0.8, 0.94
+"""From which ratio on a second neighbour stands in a row of its own, and the ratio that this row claims."""
 MATCHED_METHODS = ("NN + PoseLib 0.75 px", "NN + PoseLib progressive 0.75 px", "product")
 """What gets matches that others have found: rows of the scoreboard."""
 DEFAULT_SETTINGS = ("sift-2000", "rootsift-2000", "rootsift-4000", "rootsift-8000")
@@ -85,7 +97,28 @@ class Setting(NamedTuple):
             TypeError, ValueError, MgcaFilterError: as :class:`mgca_filter.MatchFilter`.
         """
         options: dict[str, Any] = {"model": model, **dict(self.options)}
+        options.pop("rows", None)
         return MatchFilter(seed=seed, **options)
+
+    def match(self, one: NDArray[Any], two: NDArray[Any], norm: int) -> Matches:
+        """The matches of two images' descriptors (N, D) as ``match_images`` finds them, and those that are added."""
+        rows, matches = dict(self.options).get("rows"), match_descriptors(one, two, norm)
+        if rows == "second":
+            return matches + second_rows(matches)
+        return matches if rows is None else matches + backward_rows(matches, match_descriptors(two, one, norm))
+
+
+def second_rows(matches: Matches) -> Matches:
+    """Second neighbours of ambiguous matches, as rows whose ratio is :data:`SECOND_RATIO`."""
+    ambiguous = (row[1] for row in matches if len(row) > 1 and row[0].distance >= AMBIGUOUS_RATIO * row[1].distance)
+    return tuple((m, cv2.DMatch(m.queryIdx, m.trainIdx, m.distance / SECOND_RATIO)) for m in ambiguous)
+
+
+def backward_rows(matches: Matches, back: Matches) -> Matches:
+    """Matches from image 2 to image 1 that are not among those the other way, turned round."""
+    known = {(row[0].queryIdx, row[0].trainIdx) for row in matches}
+    turned = (tuple(cv2.DMatch(m.trainIdx, m.queryIdx, m.distance) for m in row) for row in back)
+    return tuple(row for row in turned if (row[0].queryIdx, row[0].trainIdx) not in known)
 
 
 def setting(text: str) -> Setting:
@@ -100,11 +133,14 @@ def setting(text: str) -> Setting:
     if (
         detector not in DETECTORS
         or not (count.isdigit() and int(count))
-        or any(name not in FILTER_OPTIONS or not value for name, _, value in options)
+        or any(
+            value not in ROWS if name == "rows" else name not in FILTER_OPTIONS or not value
+            for name, _, value in options
+        )
     ):
         raise argparse.ArgumentTypeError(
-            f"expected {SETTING}, DETECTOR of {', '.join(DETECTORS)}, OPTION of {', '.join(FILTER_OPTIONS)}, "
-            f"got {text!r}"
+            f"expected {SETTING}, DETECTOR of {', '.join(DETECTORS)}, OPTION of {', '.join(FILTER_OPTIONS)} or rows "
+            f"({', '.join(ROWS)}), got {text!r}"
         )
     return Setting(detector, int(count), tuple((name, value) for name, _, value in options))
 
@@ -180,6 +216,25 @@ def read_scene(folder: Path, count: int | None, seed: int, among: Set[PairNames]
     return [pairs[row] for row in np.sort(rows)]
 
 
+def write_rendered(folder: Path, photos: Path, count: int, seed: int) -> None:
+    """Views of ``count`` worlds that are rendered from photographs, two of each, as a scene's folder.
+
+    Raises:
+        PhotoError: as :func:`benchmarks.detectors.rendered`.
+    """
+    worlds = rendered(photos, count, seed)
+    with (folder / "cameras.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["image", *CAMERA_COLUMNS])
+        for pair in worlds.pairs:
+            for name, R, t in ((pair.image1, np.eye(3), np.zeros(3)), (pair.image2, pair.R, pair.t)):
+                cv2.imwrite(str(folder / f"{name}.png"), worlds.images[name])
+                K = worlds.intrinsics[name]
+                writer.writerow([f"{name}.png", K[0, 0], K[1, 1], K[0, 2], K[1, 2], 0.0, *R.ravel(), *t])
+    lines = [f"{pair.image1}.png,{pair.image2}.png" for pair in worlds.pairs]
+    (folder / "pairs.csv").write_text("\n".join(["image1,image2", *lines]) + "\n")
+
+
 def _camera(row: dict[str, str]) -> Camera:
     fx, fy, cx, cy, k1 = (float(row[name]) for name in ("fx", "fy", "cx", "cy", "k1"))
     R = np.array([[float(row[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
@@ -212,27 +267,36 @@ def timed(work: Callable[[], T]) -> tuple[T, float]:
     return result, 1e3 * (time.process_time() - start)
 
 
-def run_setting(pairs: Sequence[PhotoPair], chosen: Setting, match_filter: MatchFilter) -> list[Answer]:
-    """Every pair as ``match_images`` answers it, cameras known; each photograph is searched once."""
+def run_setting(
+    pairs: Sequence[PhotoPair], chosen: Setting, match_filter: MatchFilter, shrink: float = 1.0
+) -> list[Answer]:
+    """Every pair as ``match_images`` answers it, cameras known; each photograph is searched once.
+
+    ``shrink`` is the share of their width and height that the photographs keep.
+    """
     detector = chosen.create_detector()
 
     @cache
     def found(path: Path) -> Found:
         image: Image = read_image(path)
+        if shrink < 1.0:
+            size = tuple(max(1, round(shrink * side)) for side in image.shape[1::-1])
+            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         (keypoints, descriptors), milliseconds = timed(lambda: detect_keypoints(image, detector, str(path)))
         return Found(keypoints, descriptors, (image.shape[1], image.shape[0]), milliseconds)
 
     def answer(pair: PhotoPair) -> Answer:
         one, two = (found(path) for path in pair.paths)
-        matches, matching = timed(lambda: match_descriptors(one.descriptors, two.descriptors, detector.defaultNorm()))
+        matches, matching = timed(lambda: chosen.match(one.descriptors, two.descriptors, detector.defaultNorm()))
         (first, second), resolution = pair.cameras, max(map(detector_resolution, (one.size, two.size)))
+        K1, K2 = (scaled(camera.K, shrink) for camera in (first, second))
         result, filtering = timed(
             lambda: match_filter.filter(
                 one.keypoints,
                 two.keypoints,
                 matches,
-                K1=first.K,
-                K2=second.K,
+                K1=K1,
+                K2=K2,
                 dist1=first.dist,
                 dist2=second.dist,
                 size1=one.size,
@@ -244,6 +308,12 @@ def run_setting(pairs: Sequence[PhotoPair], chosen: Setting, match_filter: Match
         return Answer(pair.error_deg(result.R, result.t), len(matches), spent)
 
     return [answer(pair) for pair in pairs]
+
+
+def scaled(K: Array, scale: float) -> Array:
+    """Intrinsics (3, 3) of an image that is ``scale`` times as large: pixels are areas, their centres shift."""
+    shift = 0.5 * scale - 0.5
+    return np.array([[scale, 0.0, shift], [0.0, scale, shift], [0.0, 0.0, 1.0]]) @ K
 
 
 @dataclass(frozen=True)
@@ -318,7 +388,7 @@ def places(scenes: Sequence[str], indoors: Collection[str]) -> list[tuple[str, l
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = done, 2 = a file or option that cannot be used."""
     parser = study_parser("photographs", __doc__)
-    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE", help="folder of photographs with cameras")
+    parser.add_argument("scenes", nargs="*", type=Path, metavar="SCENE", help="folder of photographs with cameras")
     parser.add_argument("--indoors", nargs="+", default=[], metavar="NAME", help="these scenes also by themselves")
     parser.add_argument(
         "--bundles", nargs="+", default=[], type=Path, metavar="FOLDER", help="detectors' scene bundles"
@@ -326,14 +396,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--detectors", nargs="+", default=["aliked_lightglue"], metavar="NAME", help="whose (default aliked_lightglue)"
     )
+    parser.add_argument("--rendered", type=Path, metavar="PHOTOS", help="also two views each of worlds of these")
+    parser.add_argument("--pairs", type=int, default=60, metavar="N", help="of rendered views (default 60)")
+    parser.add_argument(
+        "--shrink", type=float, default=1.0, metavar="SHARE", help="of width and height that are kept (default 1)"
+    )
     add_settings(parser, DEFAULT_SETTINGS)
-    return run_study(run, parser.parse_args(arguments))
+    options = parser.parse_args(arguments)
+    if not options.scenes and options.rendered is None:
+        parser.error("nothing to measure: give scenes, --rendered or both")
+    if options.bundles and options.rendered is not None:
+        parser.error("--bundles: nobody has bundles of views that are rendered anew")
+    return run_study(run, options)
 
 
 def run(options: argparse.Namespace) -> int:
     """Print the lines of each setting as it is measured: every scene, and all their pairs together."""
-    names = [folder.name for folder in options.scenes]
-    unknown = sorted(set(options.indoors) - set(names))
+    if not 0.0 < options.shrink <= 1.0:
+        raise ValueError(f"--shrink: expected a number above 0, at most 1, got {options.shrink:g}")
+    unknown = sorted(set(options.indoors) - {folder.name for folder in options.scenes})
     if unknown:
         raise ValueError(f"--indoors: no scene {', '.join(unknown)}")
     given = found_matches(options)
@@ -341,14 +422,28 @@ def run(options: argparse.Namespace) -> int:
     for folder, lists in zip(options.scenes, given):
         among = set.intersection(*(set(one.pairs) for one in lists)) if lists else None
         scenes.append(read_scene(folder, options.per_scene, options.seed, among))
+    with TemporaryDirectory() as worlds:
+        if options.rendered is not None:
+            folder = Path(worlds) / "rendered"
+            folder.mkdir()
+            write_rendered(folder, options.rendered, options.pairs, options.seed)
+            scenes.append(read_scene(folder, None, options.seed))
+        print_table(scenes, given, options)
+    return 0
+
+
+def print_table(
+    scenes: Sequence[Sequence[PhotoPair]], given: Sequence[Sequence[FoundMatches]], options: argparse.Namespace
+) -> None:
+    """Print the lines of each row as it is measured."""
     print(markdown_head(HEADER, ALIGN))
+    names = [*(folder.name for folder in options.scenes), *(["rendered"] if options.rendered is not None else [])]
     first: list[list[Answer]] = []
     for label, answers in measured(scenes, given, options):
         first = first or answers
         for place, members in places(names, options.indoors):
             ours, theirs = (sum((each[i] for i in members), []) for each in (answers, first))
             print(markdown_row(row(place, label, ours, theirs)), flush=True)
-    return 0
 
 
 def measured(
@@ -363,7 +458,7 @@ def measured(
     for chosen in options.settings:
         match_filter = chosen.match_filter(options.model, options.seed)
         run_setting(scenes[0][:1], chosen, match_filter)  # the first call opens the model
-        yield str(chosen), [run_setting(pairs, chosen, match_filter) for pairs in scenes]
+        yield str(chosen), [run_setting(pairs, chosen, match_filter, options.shrink) for pairs in scenes]
 
 
 if __name__ == "__main__":
