@@ -67,6 +67,8 @@ FILTER_OPTIONS = ("effort", "geometry", "method", "model")
 CAMERA_COLUMNS = ("fx", "fy", "cx", "cy", "k1", *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)), "tx", "ty", "tz")
 ROWS = ("second", "backward")
 """Matches that a setting may add to those of ``match_images``, by ``rows=``."""
+RENDERED = "rendered"
+"""The scene of rendered worlds."""
 AMBIGUOUS_RATIO, SECOND_RATIO = 0.8, 0.94
 """From which ratio on a second neighbour stands in a row of its own, and the ratio that this row claims."""
 MATCHED_METHODS = ("NN + PoseLib 0.75 px", "NN + PoseLib progressive 0.75 px", "product")
@@ -378,11 +380,15 @@ def row(scene: str, label: str, answers: Sequence[Answer], first: Sequence[Answe
 
 
 def places(scenes: Sequence[str], indoors: Collection[str]) -> list[tuple[str, list[int]]]:
-    """Which scenes a line of the table is over, and its name: each alone, those outdoors, those indoors, all."""
+    """Which scenes a line of the table is over, and its name: each alone, those outdoors, those indoors, all.
+
+    Rendered worlds stand alone.
+    """
     inside = [i for i, name in enumerate(scenes) if name in indoors]
-    outside = [i for i, name in enumerate(scenes) if name not in indoors]
+    outside = [i for i, name in enumerate(scenes) if name not in (*indoors, RENDERED)]
     apart = [("outdoors", outside), ("indoors", inside)] if inside and outside else []
-    return [*((name, [i]) for i, name in enumerate(scenes)), *apart, ("all", list(range(len(scenes))))]
+    everything = [("all", sorted(inside + outside))] if inside or outside else []
+    return [*((name, [i]) for i, name in enumerate(scenes)), *apart, *everything]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -424,7 +430,7 @@ def run(options: argparse.Namespace) -> int:
         scenes.append(read_scene(folder, options.per_scene, options.seed, among))
     with TemporaryDirectory() as worlds:
         if options.rendered is not None:
-            folder = Path(worlds) / "rendered"
+            folder = Path(worlds) / RENDERED
             folder.mkdir()
             write_rendered(folder, options.rendered, options.pairs, options.seed)
             scenes.append(read_scene(folder, None, options.seed))
@@ -437,7 +443,7 @@ def print_table(
 ) -> None:
     """Print the lines of each row as it is measured."""
     print(markdown_head(HEADER, ALIGN))
-    names = [*(folder.name for folder in options.scenes), *(["rendered"] if options.rendered is not None else [])]
+    names = [*(folder.name for folder in options.scenes), *([RENDERED] if options.rendered is not None else [])]
     first: list[list[Answer]] = []
     for label, answers in measured(scenes, given, options):
         first = first or answers

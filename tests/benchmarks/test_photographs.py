@@ -223,7 +223,7 @@ def test_rendered_worlds_are_a_scene(folder: Path, model_file: Path, tmp_path: P
     words = ["--rendered", str(photos), "--pairs", "2", "--model", str(model_file), "--settings", "sift-800"]
     assert photographs.main(words) == 0
     table = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
-    assert [(line[0], line[2]) for line in table] == [("rendered", "2"), ("all", "2")]
+    assert [(line[0], line[2]) for line in table] == [("rendered", "2")]
     assert float(table[0][4]) > 0  # the cameras are those of the views
     for unusable in ([], ["--rendered", str(photos), "--bundles", str(folder)]):
         with pytest.raises(SystemExit):
@@ -242,6 +242,8 @@ def test_scenes_stand_alone_by_place_and_together(folder: Path, capsys: pytest.C
     alone = [("hall", [0]), ("yard", [1]), ("attic", [2])]
     apart = [("outdoors", [1]), ("indoors", [0, 2])]
     assert places(["hall", "yard", "attic"], ["attic", "hall"]) == [*alone, *apart, ("all", [0, 1, 2])]
+    worlds = places(["hall", "yard", "attic", "rendered"], ["attic", "hall"])
+    assert worlds == [*alone, ("rendered", [3]), *apart, ("all", [0, 1, 2])]
     assert places(["hall", "attic"], ["attic", "hall"]) == [("hall", [0]), ("attic", [1]), ("all", [0, 1])]
     assert photographs.main([str(folder), "--indoors", "cellar"]) == 2
     assert "no scene cellar" in capsys.readouterr().err
