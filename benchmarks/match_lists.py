@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mgca_filter.data import PairSource, open_sources
-from mgca_filter.data.scene_bundle import ScenePair
+from mgca_filter.data.scene_bundle import ScenePair, scene_and_detector
 from mgca_filter.data.source import Image
 from mgca_filter.errors import DatasetError
 from mgca_filter.evaluation.pairs import SceneSelection, draw_indices
@@ -166,7 +166,7 @@ def open_detector_scenes(
     """
     found = []
     for source in open_sources(paths):
-        scene, _, detector = source.scene.partition(".")
+        scene, detector = scene_and_detector(source.scene)
         indices: Sequence[int] = range(len(source))
         if gaps is not None:
             indices = [i for i in indices if (one := source[i]) and frame_gap(one.image1, one.image2) in gaps]

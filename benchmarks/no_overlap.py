@@ -26,12 +26,12 @@ from tqdm import tqdm
 from mgca_filter import MatchFilter
 from mgca_filter.data.source import detect, read_image
 from mgca_filter.export.pairs_apart import PairApart, Rectangle, crop, lists_of, parts_of_photographs, rendered_apart
-from mgca_filter.features import create_detector, match_features
+from mgca_filter.features import match_features
 from mgca_filter.geometry.epipolar import essential_from_pose, homogeneous, sampson_distance
 from mgca_filter.result import FilterResult, Status
 from mgca_filter.tables import markdown_head, markdown_row
 
-from .photographs import Camera, PhotoPair, read_scene, setting
+from .photographs import Camera, PhotoPair, Setting, add_settings, read_scene
 from .study import run_study, study_parser
 
 Array = NDArray[np.float64]
@@ -239,16 +239,14 @@ def different_places(scenes: dict[str, list[Photograph]], count: int, seed: int)
         yield _pair_of("two", (one, two), (one.whole, two.whole))
 
 
-def judge(
-    pairs: Iterator[PairApart], options: argparse.Namespace, match_filter: MatchFilter
-) -> dict[str, list[FilterResult]]:
-    """What the filter says of the lists of pairs, by detector and kind of list."""
-    detectors = {str(chosen): create_detector(*chosen) for chosen in options.settings}
+def judge(pairs: Iterator[PairApart], settings: dict[Setting, MatchFilter]) -> dict[str, list[FilterResult]]:
+    """What the filter of each setting says of the lists of pairs, by setting and kind of list."""
+    detectors = {chosen: chosen.create_detector() for chosen in settings}
     answers: dict[str, list[FilterResult]] = {}
     for pair in tqdm(pairs, unit=" pairs", disable=None):
-        for name, detector in detectors.items():
-            for kind, matches in lists_of(pair, detector):
-                answers.setdefault(f"{name}, {kind}", []).append(match_filter.filter_many([matches])[0])
+        for chosen, match_filter in settings.items():
+            for kind, matches in lists_of(pair, detectors[chosen]):
+                answers.setdefault(f"{chosen}, {kind}", []).append(match_filter.filter_many([matches])[0])
     return answers
 
 
@@ -280,14 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", nargs="+", default=[], type=Path, metavar="SCENE", help="photographs with cameras")
     parser.add_argument("--photos", type=Path, metavar="FOLDER", help="to be cut in two, and to render worlds of")
     parser.add_argument("--pairs", type=int, default=60, metavar="N", help="of each kind (default 60)")
-    parser.add_argument(
-        "--settings",
-        nargs="+",
-        type=setting,
-        default=[setting(text) for text in DEFAULT_SETTINGS],
-        metavar="DETECTOR-COUNT",
-        help=f"default {' '.join(DEFAULT_SETTINGS)}",
-    )
+    add_settings(parser, DEFAULT_SETTINGS)
     return run_study(run, parser.parse_args(arguments))
 
 
@@ -312,10 +303,10 @@ def sources(options: argparse.Namespace) -> Iterator[tuple[str, Iterator[PairApa
 
 def run(options: argparse.Namespace) -> int:
     """Print the lines of each kind of pairs as it is measured."""
-    match_filter = MatchFilter(model=options.model, seed=options.seed)
+    settings = {chosen: chosen.match_filter(options.model, options.seed) for chosen in options.settings}
     print(markdown_head(HEADER, ALIGN))
     for kind, pairs in sources(options):
-        for matches, results in sorted(judge(pairs, options, match_filter).items(), reverse=True):
+        for matches, results in sorted(judge(pairs, settings).items(), reverse=True):
             print(markdown_row(row(kind, matches, results)), flush=True)
     return 0
 

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from .. import detectors, focal_error, no_overlap, prefiltered_pairs, score_calibration, verdicts
+from .. import detectors, focal_error, no_overlap, photographs, prefiltered_pairs, score_calibration, verdicts
 from ..bad_input import __main__ as bad_input
 from .pages import fill_file, provenance
 
@@ -47,6 +47,15 @@ def studies(options: argparse.Namespace) -> dict[str, tuple[Study, list[str]]]:
         ),
         "focal_error": (focal_error.main, [bundles, *each]),
         "detectors": (detectors.main, [*scenes, "--rendered", photos]),
+        "photographs": (
+            photographs.main,
+            [
+                *map(str, options.photographs),
+                *("--indoors", *options.indoors),
+                *("--bundles", str(options.detector_bundles), "--detectors", "aliked_lightglue", "xfeat2k"),
+                *("--settings", "rootsift-4000", "rootsift-8000"),
+            ],
+        ),
     }
 
 
@@ -73,6 +82,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--same-place", type=Path, required=True, help="those that are not: a line for each place")
     parser.add_argument(
         "--scene", nargs=2, action="append", default=[], metavar=("IMAGES", "BUNDLE"), help="photographs of a bundle"
+    )
+    parser.add_argument(
+        "--photographs", nargs="+", required=True, type=Path, metavar="SCENE", help="folders with cameras"
+    )
+    parser.add_argument("--indoors", nargs="+", required=True, metavar="NAME", help="those of them that are indoors")
+    parser.add_argument(
+        "--detector-bundles", type=Path, required=True, metavar="FOLDER", help="with ALIKED's and XFeat's"
     )
     parser.add_argument("--store", type=Path, required=True, help="keeps features, matches and answers")
     parser.add_argument("--only", nargs="+", metavar="PLACE", help="these places of the page alone")

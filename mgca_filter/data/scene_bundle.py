@@ -127,7 +127,7 @@ class SceneBundle:
     @property
     def photographs(self) -> str:
         """The scene without its detector: bundles ``lounge`` and ``lounge.orb2k`` are made of the same photographs."""
-        return self.scene.partition(".")[0]
+        return scene_and_detector(self.scene)[0]
 
     @property
     def _packed_fields(self) -> tuple[str, ...]:
@@ -260,6 +260,12 @@ class SceneBundle:
             angle1=angle[k1] * degrees,
             angle2=angle[k2] * degrees,
         )
+
+
+def scene_and_detector(stem: str) -> tuple[str, str]:
+    """What a bundle's name says, ``scene`` or ``scene.detector``; the detector is ``""`` where it says none."""
+    scene, _, detector = stem.partition(".")
+    return scene, detector
 
 
 def load_scene_bundles(folder: str | Path) -> list[SceneBundle]:

@@ -13,7 +13,10 @@ from benchmarks.fill_docs import pages, trust
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "trust.md"
-PLACES = ("bad_input", "verdicts", "no_overlap", "score_calibration", "prefiltered_pairs", "focal_error", "detectors")
+PLACES = (
+    *("bad_input", "verdicts", "no_overlap", "score_calibration", "prefiltered_pairs", "focal_error", "detectors"),
+    "photographs",
+)
 
 
 @pytest.fixture
@@ -26,6 +29,7 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 ARGUMENTS = ["--bundles", "B", "--rendered", "R.npz", "--photos", "P", "--same-place", "S", "--store", "D"]
+ARGUMENTS += ["--photographs", "hall", "yard", "--indoors", "hall", "--detector-bundles", "D"]
 
 
 def test_studies_fill_their_places_and_nothing_else_changes(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,17 +43,18 @@ def test_studies_fill_their_places_and_nothing_else_changes(page: Path, monkeypa
 
         return study
 
-    for name in ("bad_input", "prefiltered_pairs"):
+    for name in ("bad_input", "prefiltered_pairs", "photographs"):
         monkeypatch.setattr(getattr(trust, name), "main", fake(name, status=int(name == "bad_input")))
     before = page.read_text(encoding="utf-8")
     for _ in range(2):
-        trust.main([*ARGUMENTS, "--only", "bad_input", "prefiltered_pairs"])
+        trust.main([*ARGUMENTS, "--only", "bad_input", "prefiltered_pairs", "photographs"])
         after = page.read_text(encoding="utf-8")
-        for name in ("bad_input", "prefiltered_pairs"):
+        for name in ("bad_input", "prefiltered_pairs", "photographs"):
             assert f"<!-- {name} -->\n| {name} |\n\n{trust.provenance()}\n<!-- /{name} -->" in after
     assert seen["prefiltered_pairs"][:2] == ["B", "R.npz"]
-    assert set(seen) == {"bad_input", "prefiltered_pairs"}
-    blocks = re.compile(r"<!-- (bad_input|prefiltered_pairs) -->\n.*?<!-- /\1 -->", re.DOTALL)
+    assert seen["photographs"][:6] == ["hall", "yard", "--indoors", "hall", "--bundles", "D"]
+    assert set(seen) == {"bad_input", "prefiltered_pairs", "photographs"}
+    blocks = re.compile(r"<!-- (bad_input|prefiltered_pairs|photographs) -->\n.*?<!-- /\1 -->", re.DOTALL)
     assert blocks.sub("", after) == blocks.sub("", before)
 
 

@@ -16,6 +16,7 @@ from mgca_filter.data.scene_bundle import (
     SceneBundle,
     ScenePair,
     load_scene_bundles,
+    scene_and_detector,
 )
 from mgca_filter.data.scene_bundle import (
     write_bundle as write,
@@ -318,3 +319,8 @@ def test_what_cannot_be_written_leaves_no_file(tmp_path, scenes):
     equal = replace(matches, attributes=replace(matches.attributes, best=None))  # all distances are the same
     write(tmp_path / "hall.npz", images, [replace(pairs[0], matches=equal)])
     assert SceneBundle(tmp_path / "hall.npz")[0].attributes.best.all()
+
+
+def test_a_bundles_name_tells_scene_and_detector() -> None:
+    assert scene_and_detector("hall") == ("hall", "")
+    assert scene_and_detector("hall.aliked_lightglue") == ("hall", "aliked_lightglue")
