@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from ..data.scene_bundle import SceneBundle, ScenePair
+from ..data.scene_bundle import SceneBundle, ScenePair, scene_and_detector
 from ..data.source import detect
 from ..evaluation.environment import one_thread
 from ..evaluation.metrics import FAILURE_DEG
@@ -241,7 +241,7 @@ def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Samp
     samples: list[Sample] = []
     paths = [path for folder in options.bundles for path in sorted(folder.glob("*.npz"))]
     for path in tqdm(paths, unit=" bundles", disable=None):
-        scene = path.stem.split(".")[0]
+        scene = scene_and_detector(path.stem)[0]
         if "lightglue" in path.stem or scene in options.exclude or (sound is not None and scene not in sound):
             continue
         bundle = SceneBundle(path)
