@@ -21,6 +21,8 @@ constexpr double kUsual = -0.3, kUsualSpread = 0.35;
 constexpr double kThresholdPx = 2.0;
 // What makes of the curvature a standard deviation that two thirds of the training pairs keep.
 constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
+// Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
+constexpr double kLargestRatioSigma = 0.5;
 // Under a focal length far from the right one matches lie this far off before the pose is refined.
 constexpr double kReachPx = 16.0;
 constexpr int kRounds = 6;
@@ -102,7 +104,19 @@ std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorG
     const double log_factor = std::clamp(logs[best] - slope / (2.0 * curvature), logs[best - 1], logs[best + 1]);
     // A sum of squares over the noise rises by one at a standard deviation, if matches were independent.
     const double sigma = std::hypot(kSigmaFactor / std::sqrt(curvature), kLeastSigma);
-    return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma)}, best};
+    return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma), 0.0}, best};
+}
+
+/// Of the logarithms of the factors. Where both images share one, either may be off by as much as the ratio is open, the
+/// one up, the other down: that they share it is an assumption, whose errors are larger than those of noise.
+cv::Matx22d covariance(const FocalEstimate& estimate) {
+    const double first = estimate.sigmas[0], second = estimate.sigmas[1], both = first * second;
+    const double squared = std::pow(std::min(estimate.ratio_sigma, kLargestRatioSigma), 2);
+    if (estimate.factors[0] == estimate.factors[1]) {
+        return {both + squared, both - squared, both - squared, both + squared};
+    }
+    const double mixed = std::clamp(0.5 * (first * first + second * second - squared), -both, both);
+    return {first * first, mixed, mixed, second * second};
 }
 
 }  // namespace
@@ -127,6 +141,7 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
     }
     const auto [shared, best] = shared_factor(logs, costs, rows.size());
     std::vector<FocalEstimate> estimates;
+    double ratio_sigma = 0.0;
     if (trials[best].pose && std::isfinite(costs[best])) {
         double sum = 0.0;
         for (const double distance : sampson_distances(agreeing, F)) {
@@ -135,15 +150,40 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
         const double noise =
             std::max(std::sqrt(sum / static_cast<double>(agreeing.size())), kBestNoisePx / evidence.focal_px);
         const FocalPairFit fit(rows, kThresholdPx / evidence.focal_px, noise, {kUsual, kUsualSpread});
-        if (const auto two = fit.differing(*trials[best].pose, logs[best])) {
+        const auto [two, sigma_beside] = fit.differing(*trials[best].pose, logs[best]);
+        ratio_sigma = sigma_beside;
+        if (two) {
             estimates.push_back({{std::exp(two->logs[0]), std::exp(two->logs[1])},
-                                 {std::hypot(two->sigmas[0], kLeastSigma), std::hypot(two->sigmas[1], kLeastSigma)}});
+                                 {std::hypot(two->sigmas[0], kLeastSigma), std::hypot(two->sigmas[1], kLeastSigma)},
+                                 two->ratio_sigma});
         }
     }
     if (shared) {
-        estimates.push_back(*shared);
+        estimates.push_back({shared->factors, shared->sigmas, ratio_sigma});
     }
     return estimates;
+}
+
+double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const FocalEstimate& estimate) {
+    const Correspondences rows = agreeing_with(evidence, model.M);
+    if (rows.size() < kMinRows) {
+        return 180.0;
+    }
+    const cv::Matx<double, 5, 2> derivative = FocalPairFit(rows, kInfinity, 1.0, {0.0, 1.0}).pose_derivative(model.pose);
+    const cv::Matx<double, 5, 5> moved = derivative * covariance(estimate) * derivative.t();
+    double variance = 0.0;
+    const auto add = [&](const cv::Mat& part) {
+        cv::Mat values;
+        cv::eigen(part, values);
+        variance = std::max(variance, values.at<double>(0));
+    };
+    add(cv::Mat(moved.get_minor<3, 3>(0, 0)));
+    add(cv::Mat(moved.get_minor<2, 2>(3, 3)));
+    return std::min(std::sqrt(variance) * 180.0 / CV_PI, 180.0);
+}
+
+double share_within_10_deg(double sigma_deg) {
+    return 1.0 - std::exp(-0.5 * std::pow(10.0 / std::max(sigma_deg, 1e-3), 2));
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -42,12 +42,13 @@ std::array<cv::Vec3d, 2> householder_basis(const cv::Vec3d& t) {
 FocalPairFit::FocalPairFit(Correspondences rows, double threshold, double noise, const FocalBelief& belief)
     : rows_(std::move(rows)), threshold_(threshold), scale_(1.0 / (kTemper * noise * noise)), belief_(belief) {}
 
-std::optional<TwoFocals> FocalPairFit::differing(const Pose& pose, double log_factor) const {
+std::pair<std::optional<TwoFocals>, double> FocalPairFit::differing(const Pose& pose, double log_factor) const {
     const State shared{pose, {log_factor, log_factor}};
     const double before = cost(distances(shared), shared.logs);
     TwoFocals found = refined(shared);
+    const double sigma_beside = found.ratio_sigma;
     if (before - found.cost < kMinGain) {
-        return std::nullopt;
+        return {std::nullopt, sigma_beside};
     }
     for (const double zoom : kZooms) {
         const double half = 0.5 * std::log(zoom);
@@ -58,7 +59,20 @@ std::optional<TwoFocals> FocalPairFit::differing(const Pose& pose, double log_fa
     }
     const double apart = std::abs(found.logs[1] - found.logs[0]);
     const bool believed = apart > std::max(kMinLogRatio, kMinRatioSigmas * found.ratio_sigma);
-    return believed ? std::optional(found) : std::nullopt;
+    return {believed ? std::optional(found) : std::nullopt, sigma_beside};
+}
+
+cv::Matx<double, 5, 2> FocalPairFit::pose_derivative(const Pose& pose) const {
+    const State state{pose, {0.0, 0.0}};
+    cv::Matx<double, 5, 5> hessian;
+    cv::Matx<double, 5, 2> mixed;
+    for (const Step& row : jacobian(state, distances(state))) {
+        const cv::Vec<double, 5> of_pose(row[0], row[1], row[2], row[3], row[4]);
+        hessian += of_pose * of_pose.t();
+        mixed += of_pose * cv::Matx<double, 1, 2>(row[5], row[6]);
+    }
+    hessian += (1e-9 * cv::trace(hessian) + 1e-12) * cv::Matx<double, 5, 5>::eye();
+    return -1.0 * hessian.solve(mixed, cv::DECOMP_LU);
 }
 
 FocalPairFit::State FocalPairFit::moved(const State& state, const Step& step) {

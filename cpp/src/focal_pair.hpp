@@ -35,10 +35,16 @@ public:
     /// where the error is cut off, in that unit. noise: standard deviation of the distances, likewise.
     FocalPairFit(Correspondences rows, double threshold, double noise, const FocalBelief& belief);
 
-    /// The best with two focal lengths, or nothing where one does about as well.
+    /// The best with two focal lengths, or nothing where one does about as well; and how surely one does: the standard
+    /// deviation of the logarithm of the ratio about it.
     ///
     /// @param pose, log_factor the pose and the logarithm of the factor on both guesses that suit the matches best.
-    std::optional<TwoFocals> differing(const Pose& pose, double log_factor) const;
+    std::pair<std::optional<TwoFocals>, double> differing(const Pose& pose, double log_factor) const;
+
+    /// How the best pose moves with the logarithms of both focal lengths: turns and moves of t, radians.
+    ///
+    /// @param pose the one that suits the matches best under the guessed focal lengths.
+    cv::Matx<double, 5, 2> pose_derivative(const Pose& pose) const;
 
 private:
     struct State {

@@ -8,7 +8,7 @@ surely. Where one focal length leaves more than two would, the images are of two
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ _USUAL, _USUAL_SPREAD = -0.3, 0.35
 _THRESHOLD_PX = 2.0
 # What makes of the curvature a standard deviation that two thirds of the training pairs keep.
 _SIGMA_FACTOR, _LEAST_SIGMA = 3.0, 0.04
+# Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
+_LARGEST_RATIO_SIGMA = 0.5
 # Under a focal length far from the right one matches lie this far off before the pose is refined.
 _REACH_PX = 16.0
 _ROUNDS = 6
@@ -46,15 +48,31 @@ class FocalEstimate:
     Attributes:
         factors: on the guessed ones, of image 1 and 2; equal where both images share the factor.
         sigmas: standard deviations of their logarithms: 0.1 is ten per cent.
+        ratio_sigma: the same of their ratio; where both images share the factor, how surely they do.
     """
 
     factors: tuple[float, float]
     sigmas: tuple[float, float]
+    ratio_sigma: float = 0.0
 
     @property
     def shared(self) -> bool:
         """Both images have the same factor."""
         return self.factors[0] == self.factors[1]
+
+    @property
+    def covariance(self) -> Array:
+        """Of the logarithms, (2, 2).
+
+        Where both images share the factor, either may be off by as much as the ratio is open, the one up, the other
+        down: that they share it is an assumption, whose errors are larger than those of noise.
+        """
+        (first, second), ratio = self.sigmas, min(self.ratio_sigma, _LARGEST_RATIO_SIGMA)
+        both = first * second
+        if self.shared:
+            return both * np.ones((2, 2)) + ratio**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        mixed = float(np.clip(0.5 * (first**2 + second**2 - ratio**2), -both, both))
+        return np.array([[first**2, mixed], [mixed, second**2]])
 
 
 def estimate_focals(evidence: Evidence, F: Array) -> list[FocalEstimate]:
@@ -85,11 +103,12 @@ def estimate_focals(evidence: Evidence, F: Array) -> list[FocalEstimate]:
     if trial.R is not None and trial.t is not None and np.isfinite(trial.cost_px):
         noise_px = max(float(np.sqrt(np.mean(distance_px[near] ** 2))), _LEAST_NOISE_PX)
         fit = FocalPairFit(rows, _THRESHOLD_PX / focal_px, noise_px / focal_px, FocalBelief(_USUAL, _USUAL_SPREAD))
-        two = fit.differing(trial.R, trial.t, float(np.log(_FACTORS[best])))
+        two, ratio_sigma = fit.differing(trial.R, trial.t, float(np.log(_FACTORS[best])))
+        estimates = [replace(estimate, ratio_sigma=ratio_sigma) for estimate in estimates]
         if two is not None:
             first, second = (float(factor) for factor in np.exp(two.logs))
             sigma1, sigma2 = (float(sigma) for sigma in np.hypot(two.sigmas, _LEAST_SIGMA))
-            estimates.insert(0, FocalEstimate((first, second), (sigma1, sigma2)))
+            estimates.insert(0, FocalEstimate((first, second), (sigma1, sigma2), two.ratio_sigma))
     return estimates
 
 
@@ -124,6 +143,28 @@ def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free
         for e, m in ((evidence, model), (free, free_model))
     ]
     return bool(counts[0] >= _LEAST_AGREEMENT * counts[1])
+
+
+def pose_sigma_deg(evidence: Evidence, model: TwoViewModel, estimate: FocalEstimate) -> float:
+    """Standard deviation of a pose along its worst direction that comes of the focal lengths' alone, degrees.
+
+    Args:
+        evidence, model: under the estimated focal lengths.
+    """
+    rows = evidence.correspondences[evidence.above(0.0)]
+    rows = rows[sampson_distance(rows, model.M) < REFINE_PX / evidence.focal_px]
+    if len(rows) < _MIN_ROWS:
+        return 180.0
+    fit = FocalPairFit(rows, np.inf, 1.0, FocalBelief(0.0, 1.0))
+    derivative = fit.pose_derivative(model.R, model.t)
+    moved = derivative @ estimate.covariance @ derivative.T
+    variance = max(float(np.linalg.eigvalsh(part)[-1]) for part in (moved[:3, :3], moved[3:, 3:]))
+    return float(min(np.degrees(np.sqrt(max(variance, 0.0))), 180.0))
+
+
+def share_within_10_deg(sigma_deg: float) -> float:
+    """Probability that a pose of that standard deviation, in two directions, is within 10 degrees (Rayleigh)."""
+    return float(1.0 - np.exp(-0.5 * (10.0 / max(sigma_deg, 1e-3)) ** 2))
 
 
 @dataclass(frozen=True)

@@ -84,24 +84,40 @@ class FocalPairFit:
         self._threshold, self._belief = threshold, belief
         self._scale = 1.0 / (TEMPER * noise**2)
 
-    def differing(self, R: Array, t: Array, log_factor: float) -> TwoFocals | None:
+    def differing(self, R: Array, t: Array, log_factor: float) -> tuple[TwoFocals | None, float]:
         """The best with two focal lengths, or None where one does about as well.
 
         Args:
             R, t, log_factor: pose and logarithm of the factor on both guesses that suit the matches best.
+
+        Returns:
+            The best, and how surely one does as well: the standard deviation of the logarithm of the ratio about it.
         """
         shared = np.array([log_factor, log_factor])
         before = self._cost(self._distances(R, t, shared), shared)
-        found = self._refined(R, t, shared)
+        beside = found = self._refined(R, t, shared)
         if before - found.cost < MIN_GAIN:
-            return None
+            return None, beside.ratio_sigma
         for zoom in _ZOOMS:
             half = 0.5 * np.log(zoom)
             other = self._refined(R, t, shared + np.array([-half, half]))
             if other.cost < found.cost:
                 found = other
         apart = abs(found.log_ratio) > max(MIN_LOG_RATIO, MIN_RATIO_SIGMAS * found.ratio_sigma)
-        return found if apart else None
+        return found if apart else None, beside.ratio_sigma
+
+    def pose_derivative(self, R: Array, t: Array) -> Array:
+        """How the best pose moves with the logarithms of both focal lengths, (5, 2): turns and moves of t, radians.
+
+        Args:
+            R, t: the pose that suits the matches best under the guessed focal lengths.
+        """
+        logs = np.zeros(2)
+        jacobian = self._jacobian(R, t, logs, self._distances(R, t, logs))
+        pose, focals = jacobian[:, :5], jacobian[:, 5:]
+        hessian = pose.T @ pose
+        damping = 1e-9 * float(np.trace(hessian)) * np.eye(5) + 1e-12 * np.eye(5)
+        return -np.asarray(np.linalg.solve(hessian + damping, pose.T @ focals), dtype=np.float64)
 
     def _refined(self, R: Array, t: Array, logs: Array) -> TwoFocals:
         """Levenberg–Marquardt from a start."""

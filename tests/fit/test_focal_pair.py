@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from conftest import K, make_scene
 
 from mgca_filter.fit.focal_pair import FocalBelief, FocalPairFit, TwoFocals
-from mgca_filter.geometry.pose_refinement import rotation_from_vector
+from mgca_filter.geometry.pose_refinement import refine_pose, rotation_from_vector
 
 BELIEF = FocalBelief(-0.3, 0.35)
 GUESS = 1000.0
@@ -16,7 +17,7 @@ GUESS = 1000.0
 def fitted(points1: np.ndarray, points2: np.ndarray, R: np.ndarray, t: np.ndarray, log_factor: float, noise: float):
     """The fit from the true pose under one focal length."""
     rows = np.hstack([points1 - K[:2, 2], points2 - K[:2, 2]]) / GUESS
-    return FocalPairFit(rows, 2.0 / GUESS, max(noise, 0.1) / GUESS, BELIEF).differing(R, t, log_factor)
+    return FocalPairFit(rows, 2.0 / GUESS, max(noise, 0.1) / GUESS, BELIEF).differing(R, t, log_factor)[0]
 
 
 def zoomed(zoom: float, noise: float = 0.0, seed: int = 0, kind: str = "skew", swap: bool = False) -> TwoFocals | None:
@@ -86,6 +87,17 @@ def test_two_standard_deviations_hold_the_truth_whatever_the_noise(noise: float)
             within.extend(np.abs(found.logs - np.log(K[0, 0] / GUESS * np.array([1.0, zoom]))) < 2.0 * found.sigmas)
     assert len(within) >= 16
     assert np.mean(within) > 0.9
+
+
+def test_the_pose_moves_as_the_derivative_says() -> None:
+    """The pose refined under a focal length of image 2 that is a little off."""
+    scene = make_scene("skew", right=200, wrong=0, noise_px=0.0)
+    rows = np.hstack([scene.points1 - K[:2, 2], scene.points2 - K[:2, 2]]) / K[0, 0]
+    derivative = FocalPairFit(rows, np.inf, 1.0, BELIEF).pose_derivative(scene.R, scene.t)
+    step = 1e-3
+    R, _ = refine_pose(rows / [1, 1, np.exp(step), np.exp(step)], scene.R, scene.t, 0.1, 30)
+    turned = cv2.Rodrigues(R @ scene.R.T)[0].ravel()
+    np.testing.assert_allclose(turned, derivative[:3, 1] * step, atol=0.1 * np.abs(turned).max())
 
 
 def test_rotation_alone_starts_nothing() -> None:
