@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .fit.evidence import FIRM_MATCHES, Evidence, gather_before, gather_scored
-from .fit.focal_estimate import FocalEstimate, agrees_as_well, estimate_focals
+from .fit.focal_estimate import (
+    FocalEstimate,
+    agrees_as_well,
+    confidence_under_estimate,
+    estimate_focals,
+    pose_sigma_deg,
+)
 from .fit.mirror import judge_mirror
 from .fit.robust_fit import Search, TwoViewModel, scores_by_residuals
 from .fit.verdict import Verdict, judge, judge_homography, too_few
@@ -259,10 +265,25 @@ class MatchFilter:
         if not job.given and job.focal is None and options.geometry == "auto" and verdict.t is not None:
             verdict = replace(verdict, E=None, R=None, t=None)  # nor do matches that no focal length explains
         verdict = judge_mirror(pair, job.evidence, verdict, threshold_px, options)
+        if verdict.t is not None:
+            verdict = self._doubt_focals(job, verdict)
         found = any(model is not None for model in (verdict.F, verdict.R, verdict.H))
         if options.keep_precision is not None and found:
             verdict = replace(verdict, mask=self._keep_by_scores(pair, scores))
         return verdict
+
+    def _doubt_focals(self, job: _Job, verdict: Verdict) -> Verdict:
+        """The verdict on a pose that is no surer than its focal lengths; the matches are not in doubt with it."""
+        if job.focal is None or job.model is None or job.model.confidence is None or job.evidence is None:
+            return verdict
+        sigma_deg = pose_sigma_deg(job.evidence, job.model, job.focal)
+        confidence = confidence_under_estimate(job.model.confidence, sigma_deg)
+        info = {**verdict.info, "focal_sigma_deg": sigma_deg, "fitted_confidence": job.model.confidence}
+        job.model = replace(job.model, confidence=confidence)
+        _, usable = self._backend.metadata.choice["verdict"]
+        if verdict.status is Status.OK and confidence < usable:
+            return replace(verdict, status=Status.LOW_SUPPORT, info={**info, "focal_doubt": True})
+        return replace(verdict, info=info)
 
     def _remarks(self, verdict: Verdict, scores: NDArray[np.float32]) -> list[str]:
         """Sentences on what may surprise about the answer."""

@@ -71,6 +71,9 @@ class FilterResult:
             ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``translation_sigma_deg``
             (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``mirrored``
             (True where one of the images was flipped: there is no pose, and H mirrors where the pair is planar),
+            ``focal_sigma_deg`` (standard deviation of the pose that comes of that of estimated focal lengths) with
+            ``fitted_confidence`` (what ``confidence`` would be if they were known), ``focal_doubt`` (True where they
+            alone make the pose doubtful: ``LOW_SUPPORT``, with matches that are right all the same),
             ``focal_factor`` where the matches ask for focal lengths that many times those given (rough, a power of
             1.2).
     """
@@ -95,6 +98,16 @@ class FilterResult:
     def ok(self) -> bool:
         """The geometry may be used as it is: ``status`` is ``OK`` or ``PLANAR``."""
         return self.status in (Status.OK, Status.PLANAR)
+
+    @property
+    def verified(self) -> bool:
+        """The kept matches may be used, whatever the pose is worth: a model explains the pair.
+
+        With ``OK``, ``PLANAR`` and ``PURE_ROTATION``; and with ``LOW_SUPPORT`` where estimated focal lengths alone make
+        the pose doubtful (``info["focal_doubt"]``), of which matches and F know nothing.
+        """
+        explained = self.status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION)
+        return explained or bool(self.info.get("focal_doubt"))
 
     def __bool__(self) -> bool:
         """As :attr:`ok`."""
@@ -155,6 +168,7 @@ class FilterResult:
             confidence=self.confidence,
             focal_factor=self.info.get("focal_factor"),
             mirrored=bool(self.info.get("mirrored")),
+            focal_doubt=bool(self.info.get("focal_doubt")),
         )
         rows = {"status": self.status.value, "kept": f"{self.num_inliers} of {len(self.mask)} matches"}
         if self.R is not None:

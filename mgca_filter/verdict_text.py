@@ -66,6 +66,11 @@ _MIRRORED = (
     "One of the images is mirrored: no camera sees an opaque surface from both sides, so that there is no pose. Flip "
     "one image and match again; the kept matches, and the homography where there is one, are right as they are."
 )
+_FOCAL_DOUBT = (
+    "Both images show one scene; how the camera moved hangs on its focal length, which the matches do not tell well.",
+    "Use the kept matches and F as they are, and the pose with care: give K1 and K2 (on the command line --K "
+    "fx,fy,cx,cy) for one to rely on.",
+)
 _UNSURE = 0.5
 
 
@@ -84,6 +89,7 @@ def describe_verdict(
     confidence: float | None = None,
     focal_factor: float | None = None,
     mirrored: bool = False,
+    focal_doubt: bool = False,
 ) -> VerdictText:
     """What a status means and what to do next.
 
@@ -93,11 +99,14 @@ def describe_verdict(
         confidence: probability that the pose is within 10 degrees, or None.
         focal_factor: the matches ask for focal lengths that many times those given, or None.
         mirrored: one of the images is mirrored.
+        focal_doubt: nothing but the focal lengths is in doubt.
     """
     word = str(status)
     if word not in _TEXTS:
         return VerdictText(CAUTION, f"The filter's verdict is {word.replace('_', ' ')}.", "Look at the kept matches.")
     tone, headline, advice = _TEXTS[word]
+    if focal_doubt:
+        tone, (headline, advice) = CAUTION, _FOCAL_DOUBT
     if guessed and word == "ok":
         advice = _GUESSED
     if mirrored:

@@ -249,7 +249,7 @@ def _match(options: argparse.Namespace) -> MatchReport:
     if cameras.K2 is None:
         cameras = replace(cameras, K2=cameras.K1, dist2=cameras.dist1)
     _warn_of_cameras(cameras, photos)
-    if matched.result.ok and options.keep_precision is not None and matched.result.num_inliers == 0:
+    if matched.result.verified and options.keep_precision is not None and matched.result.num_inliers == 0:
         best = float(matched.result.scores.max(initial=0.0))
         _log.warning(
             "warning: --keep-precision %g: no match is that sure, the surest has a score of %.2f",

@@ -22,7 +22,6 @@ from ..result import FilterResult, Status
 from .compare import BaselineFit, describe_rotation, describe_translation
 from .truth import TruePose
 
-_EXPLAINED = (Status.OK, Status.PLANAR, Status.PURE_ROTATION, Status.SUSPICIOUS_INTRINSICS)
 # Only these come with a pose that can be used as it is.
 # Relative standard deviation from which on an estimated focal length is none.
 _POOR_SIGMA = 0.3
@@ -120,7 +119,7 @@ class MatchReport:
     def found_geometry(self) -> bool:
         """A model explains the pair; with ``method="none"`` nothing was fitted and there is none."""
         fitted = any(model is not None for model in (self.result.F, self.result.R, self.result.H))
-        return fitted and self.result.status in _EXPLAINED
+        return fitted and (self.result.verified or self.result.status is Status.SUSPICIOUS_INTRINSICS)
 
 
 def _pixels(keypoints: Sequence[Any]) -> NDArray[np.float64]:
@@ -170,7 +169,10 @@ def _focal_lines(report: MatchReport) -> list[str]:
         sigma = max(info["focal_sigma"])
         accuracy = f", good to about {100.0 * sigma:.0f} %" if sigma < _POOR_SIGMA else ", which hardly tell it"
         focal = " and ".join(dict.fromkeys(f"{focal:.0f}" for focal in info["focal_px"]))
-        return [f"focal length {focal} px estimated from the matches{accuracy}: {how_to} makes the pose surer"]
+        lines = [f"focal length {focal} px estimated from the matches{accuracy}: {how_to} makes the pose surer"]
+        if info.get("focal_doubt"):
+            lines.append("which makes the pose doubtful, and not the kept matches or F")
+        return lines
     if report.intrinsics != "guessed":
         return []
     focal = " and ".join(dict.fromkeys(f"{camera.K[0, 0]:.0f}" for camera in report.cameras))
@@ -200,6 +202,7 @@ def to_json(report: MatchReport) -> str:
         "image2": _side(report.path2, report.sizes[1], report.matched.keypoints2),
         "status": result.status.value,
         "confidence": _places(result.confidence, 4),
+        "verified": result.verified,
         "num_matches": len(mask),
         "num_inliers": result.num_inliers,
         **{name: _digits(getattr(result, name)) for name in ("E", "F", "R", "t", "H")},

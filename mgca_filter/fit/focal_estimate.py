@@ -30,6 +30,11 @@ _THRESHOLD_PX = 2.0
 _SIGMA_FACTOR, _LEAST_SIGMA = 3.0, 0.04
 # Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
 _LARGEST_RATIO_SIGMA = 0.5
+# How often a pose is within 10 degrees of the truth, by the log odds of the fit's confidence, which takes the focal
+# lengths for known, and the logarithm of the degrees by which they leave it open: `benchmarks/without_intrinsics.py --fit`.
+_ODDS_WEIGHT, _SIGMA_WEIGHT, _OFFSET = 0.62, -0.88, 0.33
+_LEAST_SIGMA_DEG, _LARGEST_SIGMA_DEG = 0.05, 180.0
+_LEAST_CONFIDENCE = 1e-3
 # Under a focal length far from the right one matches lie this far off before the pose is refined.
 _REACH_PX = 16.0
 _ROUNDS = 6
@@ -62,17 +67,13 @@ class FocalEstimate:
 
     @property
     def covariance(self) -> Array:
-        """Of the logarithms, (2, 2).
+        """Of the logarithms, (2, 2): both may be off together, and, as far as their ratio is open, against each other.
 
-        Where both images share the factor, either may be off by as much as the ratio is open, the one up, the other
-        down: that they share it is an assumption, whose errors are larger than those of noise.
+        Where both images share the factor, too: that they do is an assumption.
         """
-        (first, second), ratio = self.sigmas, min(self.ratio_sigma, _LARGEST_RATIO_SIGMA)
-        both = first * second
-        if self.shared:
-            return both * np.ones((2, 2)) + ratio**2 * np.array([[1.0, -1.0], [-1.0, 1.0]])
-        mixed = float(np.clip(0.5 * (first**2 + second**2 - ratio**2), -both, both))
-        return np.array([[first**2, mixed], [mixed, second**2]])
+        half = 0.5 * min(self.ratio_sigma, _LARGEST_RATIO_SIGMA)
+        together, against = np.ones((2, 2)), np.array([[1.0, -1.0], [-1.0, 1.0]])
+        return self.sigmas[0] * self.sigmas[1] * together + half**2 * against
 
 
 def estimate_focals(evidence: Evidence, F: Array) -> list[FocalEstimate]:
@@ -146,7 +147,7 @@ def agrees_as_well(evidence: Evidence, model: TwoViewModel, free: Evidence, free
 
 
 def pose_sigma_deg(evidence: Evidence, model: TwoViewModel, estimate: FocalEstimate) -> float:
-    """Standard deviation of a pose along its worst direction that comes of the focal lengths' alone, degrees.
+    """Standard deviation of a pose, along its worst direction, that comes of the focal lengths' alone, degrees.
 
     Args:
         evidence, model: under the estimated focal lengths.
@@ -154,17 +155,24 @@ def pose_sigma_deg(evidence: Evidence, model: TwoViewModel, estimate: FocalEstim
     rows = evidence.correspondences[evidence.above(0.0)]
     rows = rows[sampson_distance(rows, model.M) < REFINE_PX / evidence.focal_px]
     if len(rows) < _MIN_ROWS:
-        return 180.0
+        return _LARGEST_SIGMA_DEG
     fit = FocalPairFit(rows, np.inf, 1.0, FocalBelief(0.0, 1.0))
     derivative = fit.pose_derivative(model.R, model.t)
     moved = derivative @ estimate.covariance @ derivative.T
     variance = max(float(np.linalg.eigvalsh(part)[-1]) for part in (moved[:3, :3], moved[3:, 3:]))
-    return float(min(np.degrees(np.sqrt(max(variance, 0.0))), 180.0))
+    return float(np.clip(np.degrees(np.sqrt(max(variance, 0.0))), _LEAST_SIGMA_DEG, _LARGEST_SIGMA_DEG))
 
 
-def share_within_10_deg(sigma_deg: float) -> float:
-    """Probability that a pose of that standard deviation, in two directions, is within 10 degrees (Rayleigh)."""
-    return float(1.0 - np.exp(-0.5 * (10.0 / max(sigma_deg, 1e-3)) ** 2))
+def confidence_under_estimate(confidence: float, sigma_deg: float) -> float:
+    """Probability that a pose is within 10 degrees under focal lengths that are not known but estimated.
+
+    Args:
+        confidence: of the fit, which takes them for known; the answer is never above it.
+        sigma_deg: as of :func:`pose_sigma_deg`.
+    """
+    p = float(np.clip(confidence, _LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE))
+    log_odds = _ODDS_WEIGHT * np.log(p / (1.0 - p)) + _SIGMA_WEIGHT * np.log(sigma_deg) + _OFFSET
+    return float(min(confidence, 1.0 / (1.0 + np.exp(-log_odds))))
 
 
 @dataclass(frozen=True)

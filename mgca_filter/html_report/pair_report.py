@@ -144,6 +144,7 @@ def write_pair_report(
         confidence=getattr(result, "confidence", None),
         focal_factor=result.info.get("focal_factor"),
         mirrored=bool(result.info.get("mirrored")),
+        focal_doubt=bool(result.info.get("focal_doubt")),
     )
     words = {
         "tone": verdict.tone,

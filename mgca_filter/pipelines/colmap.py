@@ -44,6 +44,8 @@ _CONFIGURATIONS = {
     ("planar", False): _Configuration.PLANAR_OR_PANORAMIC,
     ("pure_rotation", True): _Configuration.PANORAMIC,
     ("pure_rotation", False): _Configuration.PLANAR_OR_PANORAMIC,
+    # The pose alone is in doubt, which is not among what is written.
+    ("low_support", False): _Configuration.UNCALIBRATED,
 }
 
 
@@ -321,7 +323,9 @@ def two_view_geometry(row: PairRow) -> Any:
     are not known.
     """
     geometry = pycolmap.TwoViewGeometry()
-    geometry.config = _CONFIGURATIONS.get((row.status, row.calibrated), _Configuration.DEGENERATE)
+    geometry.config = _Configuration.DEGENERATE
+    if row.verified:
+        geometry.config = _CONFIGURATIONS.get((row.status, row.calibrated), _Configuration.DEGENERATE)
     geometry.inlier_matches = row.kept
     if row.F is not None:
         geometry.F = _TO_OPENCV.T @ row.F @ _TO_OPENCV

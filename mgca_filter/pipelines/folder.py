@@ -245,8 +245,8 @@ class FolderJob:
 def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) -> None:
     """One JSON object per pair, in the order of the names.
 
-    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``, ``E``,
-    ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
+    Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``,
+    ``verified`` (the kept matches may be used, whatever the pose is worth), ``E``, ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
     ``scores`` (K,) of the kept matches, ``message`` for a pair that failed. Pixels, and the geometry between them, are
     those of the photographs as their EXIF says that they are to be shown.
     """
@@ -266,6 +266,7 @@ def _documents(read: ReadFeatures, rows: Iterable[PairRow]) -> Iterator[dict[str
             "num_inliers": len(row.kept),
             "calibrated": row.calibrated,
             "confidence": row.confidence,
+            "verified": row.verified,
             **{name: None if matrix is None else matrix.tolist() for name, matrix in matrices.items()},
             "points1": [] if image1 is None else image1.points[row.kept[:, 0]].tolist(),
             "points2": [] if image2 is None else image2.points[row.kept[:, 1]].tolist(),

@@ -225,7 +225,7 @@ class Summary:
     @property
     def found_geometry(self) -> bool:
         """A model explains one pair at least."""
-        return any(status in EXPLAINED for status in self.by_status)
+        return any(status in EXPLAINED or kept > 0 for status, (_, _, kept) in self.by_status.items())
 
     def __str__(self) -> str:
         pairs, matches, kept = (sum(column) for column in zip(*self.by_status.values(), (0, 0, 0)))

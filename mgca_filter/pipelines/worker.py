@@ -33,7 +33,7 @@ from ..match_filter import MatchFilter
 from ..result import FilterResult, Status
 
 FAILED = "failed"
-# A model of these explains the pair; the matches of all other pairs are dropped.
+# With these a model explains the pair, pose and all.
 EXPLAINED = frozenset(status.value for status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION))
 
 
@@ -75,6 +75,11 @@ class PairRow:
     confidence: float | None = None
     message: str = ""
 
+    @property
+    def verified(self) -> bool:
+        """A model explains the pair, and with it the matches that are kept, whatever the pose is worth."""
+        return self.status in EXPLAINED or len(self.kept) > 0
+
 
 class PairWorker:
     """The filter and its session, kept for many pairs.
@@ -105,8 +110,7 @@ class PairWorker:
             result, pairs = self._run(image1, image2, matches)
         except ValueError as error:
             return _failed(name1, name2, f"{name1} with {name2}: {' '.join(str(error).split())}")
-        explained = result.status.value in EXPLAINED
-        mask = result.mask & explained
+        mask = result.mask & result.verified
         return PairRow(
             name1,
             name2,
@@ -115,8 +119,8 @@ class PairWorker:
             pairs[mask].astype(np.uint32),
             result.scores[mask],
             result.info["intrinsics"] == "given",
-            **({name: getattr(result, name) for name in ("E", "F", "R", "t")} if explained else {}),
-            H=result.info.get("homography") if explained else None,
+            **({name: getattr(result, name) for name in ("E", "F", "R", "t")} if result.verified else {}),
+            H=result.info.get("homography") if result.verified else None,
             confidence=result.confidence,
         )
 
