@@ -370,6 +370,10 @@ int mgca_result_ok(const mgca_result* result) {
     return value_of(result, 0, [](const mgca::Result& known) { return known.ok() ? 1 : 0; });
 }
 
+int mgca_result_verified(const mgca_result* result) {
+    return value_of(result, 0, [](const mgca::Result& known) { return known.verified() ? 1 : 0; });
+}
+
 size_t mgca_result_size(const mgca_result* result) {
     return value_of(result, std::size_t{0}, [](const mgca::Result& known) { return known.mask.size(); });
 }
@@ -424,6 +428,9 @@ double mgca_result_number(const mgca_result* result, const char* name) {
         if (word == "mirrored") {
             return known.mirrored ? 1.0 : 0.0;
         }
+        if (word == "focal_doubt") {
+            return known.focal_doubt ? 1.0 : 0.0;
+        }
         if (word == "focal_px1" || word == "focal_px2" || word == "focal_sigma1" || word == "focal_sigma2") {
             const std::optional<cv::Vec2d>& both = word.find("focal_px") == 0 ? known.focal_px : known.focal_sigma;
             return both ? (*both)[word.back() - '1'] : std::numeric_limits<double>::quiet_NaN();
@@ -431,6 +438,8 @@ double mgca_result_number(const mgca_result* result, const char* name) {
         const std::optional<double>* value = word == "confidence"              ? &known.confidence
                                              : word == "log10_false_alarms"    ? &known.log10_false_alarms
                                              : word == "translation_sigma_deg" ? &known.translation_sigma_deg
+                                             : word == "focal_sigma_deg"       ? &known.focal_sigma_deg
+                                             : word == "fitted_confidence"     ? &known.fitted_confidence
                                              : word == "focal_factor"          ? &known.focal_factor
                                                                                : nullptr;
         if (value == nullptr) {

@@ -296,6 +296,16 @@ Result Filter::operator()(const MatchPair& matches) const {
             verdict.t.reset();
         }
         verdict = detail::judge_mirror(pair, *evidence, std::move(verdict), threshold_px, options_);
+        if (focal && model->confidence && verdict.t) {
+            // A pose is no surer than its focal lengths; the matches are not in doubt with it.
+            result.fitted_confidence = model->confidence;
+            result.focal_sigma_deg = detail::pose_sigma_deg(*evidence, *model, *focal);
+            model->confidence = detail::confidence_under_estimate(*model->confidence, *result.focal_sigma_deg);
+            if (verdict.status == Status::ok && *model->confidence < metadata.choice.verdict[1]) {
+                verdict.status = Status::low_support;
+                result.focal_doubt = true;
+            }
+        }
         if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
             verdict.mask = keep_by_scores(pair, result.scores, options_);
         }

@@ -23,6 +23,11 @@ constexpr double kThresholdPx = 2.0;
 constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
 // Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
 constexpr double kLargestRatioSigma = 0.5;
+// How often a pose is within 10 degrees of the truth, by the log odds of the fit's confidence, which takes the focal
+// lengths for known, and the logarithm of the degrees by which they leave it open: focal_estimate.py.
+constexpr double kOddsWeight = 0.62, kSigmaWeight = -0.88, kOffset = 0.33;
+constexpr double kLeastSigmaDeg = 0.05, kLargestSigmaDeg = 180.0;
+constexpr double kLeastConfidence = 1e-3;
 // Under a focal length far from the right one matches lie this far off before the pose is refined.
 constexpr double kReachPx = 16.0;
 constexpr int kRounds = 6;
@@ -107,16 +112,12 @@ std::pair<std::optional<FocalEstimate>, std::size_t> shared_factor(const FactorG
     return {FocalEstimate{cv::Vec2d::all(std::exp(log_factor)), cv::Vec2d::all(sigma), 0.0}, best};
 }
 
-/// Of the logarithms of the factors. Where both images share one, either may be off by as much as the ratio is open, the
-/// one up, the other down: that they share it is an assumption, whose errors are larger than those of noise.
+/// Of the logarithms of the factors: both may be off together, and, as far as their ratio is open, against each other;
+/// where both images share one, too: that they do is an assumption.
 cv::Matx22d covariance(const FocalEstimate& estimate) {
-    const double first = estimate.sigmas[0], second = estimate.sigmas[1], both = first * second;
-    const double squared = std::pow(std::min(estimate.ratio_sigma, kLargestRatioSigma), 2);
-    if (estimate.factors[0] == estimate.factors[1]) {
-        return {both + squared, both - squared, both - squared, both + squared};
-    }
-    const double mixed = std::clamp(0.5 * (first * first + second * second - squared), -both, both);
-    return {first * first, mixed, mixed, second * second};
+    const double together = estimate.sigmas[0] * estimate.sigmas[1];
+    const double against = std::pow(0.5 * std::min(estimate.ratio_sigma, kLargestRatioSigma), 2);
+    return {together + against, together - against, together - against, together + against};
 }
 
 }  // namespace
@@ -167,7 +168,7 @@ std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::M
 double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const FocalEstimate& estimate) {
     const Correspondences rows = agreeing_with(evidence, model.M);
     if (rows.size() < kMinRows) {
-        return 180.0;
+        return kLargestSigmaDeg;
     }
     const cv::Matx<double, 5, 2> derivative = FocalPairFit(rows, kInfinity, 1.0, {0.0, 1.0}).pose_derivative(model.pose);
     const cv::Matx<double, 5, 5> moved = derivative * covariance(estimate) * derivative.t();
@@ -179,11 +180,13 @@ double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const
     };
     add(cv::Mat(moved.get_minor<3, 3>(0, 0)));
     add(cv::Mat(moved.get_minor<2, 2>(3, 3)));
-    return std::min(std::sqrt(variance) * 180.0 / CV_PI, 180.0);
+    return std::clamp(std::sqrt(variance) * 180.0 / CV_PI, kLeastSigmaDeg, kLargestSigmaDeg);
 }
 
-double share_within_10_deg(double sigma_deg) {
-    return 1.0 - std::exp(-0.5 * std::pow(10.0 / std::max(sigma_deg, 1e-3), 2));
+double confidence_under_estimate(double confidence, double sigma_deg) {
+    const double p = std::clamp(confidence, kLeastConfidence, 1.0 - kLeastConfidence);
+    const double log_odds = kOddsWeight * std::log(p / (1.0 - p)) + kSigmaWeight * std::log(sigma_deg) + kOffset;
+    return std::min(confidence, 1.0 / (1.0 + std::exp(-log_odds)));
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

@@ -24,13 +24,16 @@ struct FocalEstimate {
 /// coordinates.
 std::vector<FocalEstimate> estimate_focals(const Evidence& evidence, const cv::Matx33d& F);
 
-/// Standard deviation of a pose along its worst direction that comes of the focal lengths' alone, degrees.
+/// Standard deviation of a pose, along its worst direction, that comes of the focal lengths' alone, degrees.
 ///
 /// @param evidence, model under the estimated focal lengths.
 double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const FocalEstimate& estimate);
 
-/// Probability that a pose of that standard deviation, in two directions, is within 10 degrees (Rayleigh).
-double share_within_10_deg(double sigma_deg);
+/// Probability that a pose is within 10 degrees under focal lengths that are not known but estimated.
+///
+/// @param confidence of the fit, which takes them for known; the answer is never above it.
+/// @param sigma_deg as of pose_sigma_deg.
+double confidence_under_estimate(double confidence, double sigma_deg);
 
 /// True where nearly as many matches agree with an essential matrix as with the F that knows no intrinsics.
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,

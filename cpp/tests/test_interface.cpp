@@ -6,6 +6,7 @@
 #include <mgca/mgca.h>
 
 #include <atomic>
+#include <cmath>
 #include <fstream>
 #include <iterator>
 #include <limits>
@@ -266,6 +267,8 @@ void two_cameras_have_two_focal_lengths(const Model& model, const MatchPair& pai
     if (check::that(result.focal_px && result.focal_sigma, "and given")) {
         check::near((*result.focal_px)[1] / (*result.focal_px)[0], 1.6, 0.1, "of two cameras");
         check::that((*result.focal_sigma)[0] > 0.0 && (*result.focal_sigma)[1] > 0.0, "with their spread");
+        check::that(result.focal_sigma_deg.value_or(0.0) > 0.0 && *result.confidence <= *result.fitted_confidence,
+                    "of which the confidence knows");
     }
     check::that(result.assumptions.size() == 4 &&
                     result.assumptions[3].find("px of image 2 estimated from the matches") != std::string::npos,
@@ -274,6 +277,11 @@ void two_cameras_have_two_focal_lengths(const Model& model, const MatchPair& pai
     known.camera1.K = cv::Matx33d(800, 0, 319.5, 0, 800, 239.5, 0, 0, 1);
     known.camera2.K = cv::Matx33d(1280, 0, 319.5, 0, 1280, 239.5, 0, 0, 1);
     check::that(!Filter(model)(known).focal_px, "what is given is not estimated");
+    Result doubtful;
+    doubtful.status = Status::low_support;
+    check::that(!doubtful.verified(), "a model that is doubtful");
+    doubtful.focal_doubt = true;
+    check::that(!doubtful.ok() && doubtful.verified(), "a pose that is no surer than its focal lengths");
     Options options;
     options.geometry = mgca::Geometry::fundamental;
     check::that(!Filter(model, options)(pair).focal_px, "nor where F is asked for");
@@ -369,6 +377,10 @@ void c_agrees(const std::filesystem::path& file, const Model& model, const Match
                 "C: scores");
     check::that(cv::Matx33d(mgca_result_matrix(result, "R")) == *expected.R, "C: R");
     check::equal(mgca_result_number(result, "confidence"), expected.confidence.value_or(-1.0), "C: confidence");
+    check::equal(mgca_result_verified(result), expected.verified() ? 1 : 0, "C: verified");
+    check::equal(mgca_result_number(result, "focal_doubt"), expected.focal_doubt ? 1.0 : 0.0, "C: focal_doubt");
+    check::that(std::isnan(mgca_result_number(result, "focal_sigma_deg")), "C: nothing is open where K is given");
+    check::that(std::isnan(mgca_result_number(result, "fitted_confidence")), "C: so that nothing was taken off");
     mgca_result_free(result);
     mgca_pair_free(c_pair);
     mgca_filter_free(c_filter);

@@ -8,6 +8,7 @@
 #include "estimators.hpp"
 #include "evidence.hpp"
 #include "focal_check.hpp"
+#include "focal_estimate.hpp"
 #include "focal_pair.hpp"
 #include "homography.hpp"
 #include "homography_fit.hpp"
@@ -227,11 +228,34 @@ Correspondences seen_under(const Correspondences& matches, double factor1, doubl
     return seen;
 }
 
+void a_pose_is_no_surer_than_its_focal_lengths() {
+    for (const double fitted : {0.0, 0.3, 0.9, 1.0}) {
+        double before = fitted;
+        for (const double sigma_deg : {0.05, 1.0, 5.0, 30.0, 180.0}) {
+            const double confidence = confidence_under_estimate(fitted, sigma_deg);
+            check::that(0.0 <= confidence && confidence <= before, "never above the fit's, and falling");
+            before = confidence;
+        }
+    }
+    check::that(confidence_under_estimate(0.95, 1.0) > 0.85 && confidence_under_estimate(0.95, 10.0) < 0.6,
+                "a degree does no harm, ten do");
+    const Pose skew{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.6, 0.5))};
+    const Correspondences rows = draw_matches(skew, 300, 0.0, 21);
+    const cv::Matx<double, 5, 2> derivative = FocalPairFit(rows, 1e9, 1.0, {0.0, 1.0}).pose_derivative(skew);
+    constexpr double kStep = 1e-3;
+    const Pose refined = refine_pose(seen_under(rows, 1.0, std::exp(-kStep)), skew, 0.1);
+    const cv::Matx33d turn = refined.R * skew.R.t();
+    const cv::Vec3d turned(turn(2, 1) - turn(1, 2), turn(0, 2) - turn(2, 0), turn(1, 0) - turn(0, 1));
+    for (int i = 0; i < 3; ++i) {
+        check::near(0.5 * turned[i] / kStep, derivative(i, 1), 0.05, "the pose moves as the derivative says");
+    }
+}
+
 void two_focal_lengths_are_found_where_they_differ() {
     const Pose skew{rotation_from_vector({0.05, -0.12, 0.03}), cv::normalize(cv::Vec3d(1.0, 0.6, 0.5))};
     const FocalBelief belief{-0.3, 0.35};
     const auto found = [&](const Correspondences& rows, const Pose& pose, double start, double noise_px) {
-        return FocalPairFit(rows, 2.0 / kFocal, noise_px / kFocal, belief).differing(pose, start);
+        return FocalPairFit(rows, 2.0 / kFocal, noise_px / kFocal, belief).differing(pose, start).first;
     };
     for (const double zoom : {0.5, 0.75, 1.3, 2.0}) {
         const double start = std::log(0.8 * std::sqrt(zoom));
@@ -399,6 +423,7 @@ int main() {
     a_line_a_rotation_and_a_plane_are_recognised();
     chance_is_told_from_support();
     a_wrong_focal_length_is_noticed();
+    a_pose_is_no_surer_than_its_focal_lengths();
     two_focal_lengths_are_found_where_they_differ();
     mirrors_are_told_and_mapped_where_that_is_allowed();
     a_loose_direction_has_a_wide_spread();

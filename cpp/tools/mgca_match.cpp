@@ -218,6 +218,7 @@ void print_json(std::ostream& out, const mgca::Result& result) {
     out << "{\n \"opencv\": \"" << CV_VERSION << "\",\n \"runtime\": \"" << mgca::Model::runtime()
         << "\",\n \"status\": \"" << mgca::to_string(result.status) << "\",\n \"num_inliers\": " << result.num_inliers
         << ",\n \"confidence\": " << (result.confidence ? json(*result.confidence) : "null")
+        << ",\n \"verified\": " << (result.verified() ? "true" : "false")
         << ",\n \"E\": " << json_matrix(result.E) << ",\n \"F\": " << json_matrix(result.F)
         << ",\n \"R\": " << json_matrix(result.R)
         << ",\n \"t\": " << (result.t ? json_array(result.t->val, result.t->val + 3) : "null")
@@ -267,7 +268,7 @@ int run(Arguments arguments) {
     } else {
         print_words(std::cout, result, elapsed.count());
     }
-    return result.ok() ? kFound : kNothingFound;
+    return result.verified() ? kFound : kNothingFound;
 }
 
 }  // namespace

@@ -244,6 +244,10 @@ struct Result {
     /// Estimated focal lengths of both images, pixels, equal unless the matches ask for two.
     std::optional<cv::Vec2d> focal_px;
     std::optional<cv::Vec2d> focal_sigma;       ///< Their relative standard deviations.
+    std::optional<double> focal_sigma_deg;      ///< Standard deviation of the pose that comes of that alone.
+    std::optional<double> fitted_confidence;    ///< What `confidence` would be if the focal lengths were known.
+    /// Estimated focal lengths alone make the pose doubtful: low_support, with matches that are right all the same.
+    bool focal_doubt = false;
     std::vector<std::string> assumptions;       ///< Sentences on what was assumed.
     int num_accepted = 0;                       ///< Matches whose logit is above the model's decision threshold.
     std::optional<cv::Matx33d> network_essential;  ///< Essential matrix as the network gave it.
@@ -276,6 +280,9 @@ struct Result {
 
     /// The geometry may be used as it is.
     bool ok() const noexcept { return status == Status::ok || status == Status::planar; }
+
+    /// The kept matches may be used, whatever the pose is worth: a model explains the pair.
+    bool verified() const noexcept { return ok() || status == Status::pure_rotation || focal_doubt; }
 };
 
 /// The filter. Safe to use from several threads; cheap to copy.

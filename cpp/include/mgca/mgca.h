@@ -149,6 +149,9 @@ MGCA_C_API int mgca_result_status(const mgca_result *result);
 /* 1 where the geometry may be used as it is, else 0. */
 MGCA_C_API int mgca_result_ok(const mgca_result *result);
 
+/* 1 where the kept matches may be used, whatever the pose is worth, else 0. */
+MGCA_C_API int mgca_result_verified(const mgca_result *result);
+
 /* Number of matches, which is that of the entries of mask, scores and logits. */
 MGCA_C_API size_t mgca_result_size(const mgca_result *result);
 
@@ -167,8 +170,9 @@ MGCA_C_API const double *mgca_result_translation(const mgca_result *result);
 
 /* "num_inliers", "num_accepted", "confidence", "num_network_matches", "support", "log10_false_alarms",
  * "translation_sigma_deg", "focal_px1", "focal_px2" (estimated focal lengths of both images), "focal_sigma1",
- * "focal_sigma2" (their relative standard deviations) or "focal_factor", NaN where there is none; "mirrored", 1 where one
- * of the images was flipped, else 0. */
+ * "focal_sigma2" (their relative standard deviations), "focal_sigma_deg" (of the pose, on their account),
+ * "fitted_confidence" (as if they were known) or "focal_factor", NaN where there is none; "mirrored", 1 where one of the
+ * images was flipped, and "focal_doubt", 1 where the focal lengths alone make the pose doubtful, else 0. */
 MGCA_C_API double mgca_result_number(const mgca_result *result, const char *name);
 
 /* "intrinsics" ("given", "estimated" or "guessed"), "origin" or "ended"; NULL for another name. */
