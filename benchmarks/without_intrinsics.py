@@ -1,8 +1,12 @@
 """Photographs without K: how good is the pose, and how sure are the focal lengths?
 
 ``python -m benchmarks.without_intrinsics [BUNDLES]``, on pairs of scene bundles: the pose that comes without K; what
-F, which comes with it, would have given with the true K; and the pose under a focal length that is guessed. ``--zooms``
-enlarges image 2 about its principal point, as if another lens had taken it. Without bundles the pairs are made up.
+F would have given with the true K, that of the same answer and that of ``geometry="fundamental"``; and the pose under
+a focal length that is guessed. ``ok`` as it is and as it would be if the estimated focal lengths were taken for known,
+and what is verified whatever the pose is worth. ``--zooms`` enlarges image 2 about its principal point, as if another
+lens had taken it. Without bundles the pairs are made up. Of a folder with ``QUALITY.csv`` the scenes whose poses can
+be trusted. ``--fit`` adds the coefficients of ``mgca_filter/fit/focal_estimate.py``, and what they give where scenes
+are left out in turn.
 """
 
 from __future__ import annotations
@@ -18,7 +22,8 @@ from numpy.typing import NDArray
 
 from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.metrics import FAILURE_DEG, mean_average_precision
-from mgca_filter.evaluation.pairs import iterate_pairs
+from mgca_filter.evaluation.pairs import iterate_pairs, select_pairs
+from mgca_filter.export.choice_fit import area_under_roc, cross_validated, fit_logistic, sound_scenes
 from mgca_filter.fit.robust_fit import pose_from_essential
 from mgca_filter.geometry.cameras import mean_focal_length
 from mgca_filter.geometry.epipolar import pose_error_deg, project_to_essential
@@ -28,13 +33,15 @@ from mgca_filter.match_filter import MatchFilter
 from mgca_filter.result import FilterResult, Status
 from mgca_filter.tables import markdown_head, markdown_row
 
-from .study import drawn_pairs, match_pair, result_error_deg, run_study, study_parser
+from .study import match_pair, result_error_deg, run_study, study_parser
 
 Array = NDArray[np.float64]
 
 SIZE = (1000, 750)
 RIGHT, WRONG, NOISE_PX = 300, 100, 0.5
 RIGHT_DEG = 10.0
+# Pairs that are not zoomed weigh as much as all others of the usual two zooms: most photographs are of one camera.
+ZOOMED_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -42,20 +49,45 @@ class Outcome:
     """One pair: pose errors in degrees, 180 without a pose, and the focal lengths.
 
     Attributes:
-        pose, with_true_K, guessed: without K; by F and the true K; by the guessed focal length.
-        status, intrinsics: words of the result.
+        pose, own_F, with_true_K, guessed: without K; by F of the answer, and by F where nothing else is asked for, with
+            the true K; by the guessed focal length.
+        status, intrinsics: words of the result. verified, kept: whether, and how many matches, are to be used.
+        confidence, fitted_confidence, sigma_deg: of the answer with an estimated focal length, else None.
         errors: (2,) logarithms of the estimated focal lengths over the true ones, None where none are estimated.
         sigmas: (2,) what the filter says of them. two: they differ.
     """
 
+    scene: str
+    zoom: float
     pose: float
+    own_F: float
     with_true_K: float
     guessed: float
     status: str
     intrinsics: str
+    verified: bool
+    kept: int
+    confidence: float | None
+    fitted_confidence: float | None
+    sigma_deg: float | None
     errors: Array | None
     sigmas: Array | None
     two: bool
+
+    @property
+    def ok(self) -> bool:
+        """``ok``, with a pose."""
+        return self.status == Status.OK and self.pose < FAILURE_DEG
+
+    @property
+    def ok_if_known(self) -> bool:
+        """The same where the estimated focal lengths are taken for known."""
+        return self.ok or (self.status == Status.LOW_SUPPORT and self.verified)
+
+    @property
+    def right(self) -> bool:
+        """The pose is near the truth."""
+        return self.pose < RIGHT_DEG
 
 
 def zoomed(pair: ScenePair, zoom: float) -> ScenePair:
@@ -97,8 +129,8 @@ def make_pair(seed: int, zoom: float) -> ScenePair:
     return ScenePair("made up", seed, "1", "2", ends1, ends2, K1, K2, SIZE, SIZE, *pose, attributes, right)
 
 
-def run_pair(pair: ScenePair, match_filter: MatchFilter, without_estimate: MatchFilter) -> Outcome:
-    """Filter a pair without K."""
+def run_pair(pair: ScenePair, zoom: float, match_filter: MatchFilter, without_estimate: MatchFilter) -> Outcome:
+    """Filter a pair, zoomed already, without K."""
     bare = replace(match_pair(pair), K1=None, K2=None)
     result, guessed = match_filter.filter_many([bare])[0], without_estimate.filter_many([bare])[0]
     errors = sigmas = None
@@ -109,8 +141,24 @@ def run_pair(pair: ScenePair, match_filter: MatchFilter, without_estimate: Match
         sigmas = np.array(result.info["focal_sigma"])
         sides = np.array([max(pair.image_size1), max(pair.image_size2)])
         two = bool(abs(np.diff(np.log(estimated / sides))[0]) > 1e-6)
-    poses = result_error_deg(result, pair), _error_with_true_K(guessed, pair), result_error_deg(guessed, pair)
-    return Outcome(*poses, str(result.status), result.info["intrinsics"], errors, sigmas, two)
+    return Outcome(
+        pair.scene,
+        zoom,
+        result_error_deg(result, pair),
+        _error_with_true_K(result, pair),
+        _error_with_true_K(guessed, pair),
+        result_error_deg(guessed, pair),
+        str(result.status),
+        result.info["intrinsics"],
+        result.verified,
+        result.num_inliers if result.verified else 0,
+        result.confidence,
+        result.info.get("fitted_confidence"),
+        result.info.get("focal_sigma_deg"),
+        errors,
+        sigmas,
+        two,
+    )
 
 
 def _error_with_true_K(result: FilterResult, pair: ScenePair) -> float:
@@ -126,19 +174,25 @@ HEADER = [
     "zoom",
     "pairs",
     "R, t mAP@20",
-    "F with the true K",
+    "its F with the true K",
+    "F alone with the true K",
     "guessed focal length",
+    "ok if known",
+    f"of these within {RIGHT_DEG:g}°",
     "ok",
     f"of these within {RIGHT_DEG:g}°",
+    "right ones left, %",
+    "verified",
+    "matches kept",
 ] + [*("estimated", "two found", "focal error, %", "within 1 sigma, %", "within 2, %")]
 
 
 def cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
     """A row: accuracies in per cent, the median error of the focal lengths, and how often it lies within sigmas."""
-    kinds = ([getattr(o, name) for o in outcomes] for name in ("pose", "with_true_K", "guessed"))
-    fine = [o for o in outcomes if o.status == Status.OK and o.pose < FAILURE_DEG]
+    kinds = ([getattr(o, name) for o in outcomes] for name in ("pose", "own_F", "with_true_K", "guessed"))
     row = [f"{zoom:g}", str(len(outcomes)), *(f"{100 * mean_average_precision(errors, 20):.1f}" for errors in kinds)]
-    row += [str(len(fine)), f"{100 * np.mean([o.pose < RIGHT_DEG for o in fine]):.1f}" if fine else ""]
+    row += _counts([o for o in outcomes if o.ok_if_known], [o for o in outcomes if o.ok])
+    row += [str(sum(o.verified for o in outcomes)), str(sum(o.kept for o in outcomes))]
     known = [(o.errors, o.sigmas) for o in outcomes if o.errors is not None and o.sigmas is not None]
     row += [str(len(known)), str(sum(o.two for o in outcomes))]
     if not known:
@@ -148,27 +202,74 @@ def cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
     return [*row, f"{100 * np.median(np.abs(errors)):.1f}", *within]
 
 
+def _counts(before: Sequence[Outcome], after: Sequence[Outcome]) -> list[str]:
+    """Numbers of answers, the second among the first, what part of each is right, and which of the right are left."""
+    right_before, right_after = (sum(o.right for o in outcomes) for outcomes in (before, after))
+    shares = [100 * right / max(len(of), 1) for right, of in ((right_before, before), (right_after, after))]
+    left = 100 * right_after / max(right_before, 1)
+    return [str(len(before)), f"{shares[0]:.1f}", str(len(after)), f"{shares[1]:.1f}", f"{left:.0f}"]
+
+
+def describe_fit(outcomes: Sequence[Outcome], usable: float) -> str:
+    """Coefficients of the confidence under estimated focal lengths, and what they do on scenes that they do not know.
+
+    Args:
+        usable: the confidence from which on a pose is ``ok``.
+    """
+    judged = [o for o in outcomes if o.fitted_confidence is not None and o.sigma_deg is not None]
+    fitted = np.array([o.fitted_confidence for o in judged], dtype=np.float64)
+    p = np.clip(fitted, 1e-3, 1 - 1e-3)
+    features = np.column_stack([np.log(p / (1 - p)), np.log(np.array([o.sigma_deg for o in judged], dtype=np.float64))])
+    right = np.array([o.right for o in judged])
+    weight = np.array([1.0 if o.zoom == 1.0 else ZOOMED_WEIGHT for o in judged])
+    weights = fit_logistic(features, right, weight)
+    confidence = np.minimum(cross_validated(features, right, weight, [o.scene for o in judged]), fitted)
+    lines = ["log odds of the fit {:.3f}, log sigma {:.3f}, offset {:.3f}".format(*weights)]
+    lines.append(f"AUROC {area_under_roc(fitted, right):.3f} -> {area_under_roc(confidence, right):.3f}")
+    lines.append(markdown_head(["confidence", "poses", "mean", "right", "poses before", "right before"]))
+    for low, high in zip((0.0, 0.2, 0.4, 0.6, 0.8, 0.9), (0.2, 0.4, 0.6, 0.8, 0.9, 1.01)):
+        now, before = ((low <= values) & (values < high) for values in (confidence, fitted))
+        row = [f"{low:g} to {min(high, 1.0):g}", str(now.sum()), f"{confidence[now].mean() if now.any() else 0:.2f}"]
+        row += [f"{right[now].mean() if now.any() else 0:.2f}", str(before.sum())]
+        lines.append(markdown_row([*row, f"{right[before].mean() if before.any() else 0:.2f}"]))
+    for zoom in (*sorted({o.zoom for o in judged}), None):
+        rows = [k for k, o in enumerate(judged) if (zoom is None or o.zoom == zoom) and o.ok_if_known]
+        cells = _counts([judged[k] for k in rows], [judged[k] for k in rows if confidence[k] >= usable])
+        name = "all" if zoom is None else f"zoom {zoom:g}"
+        lines.append("{}: ok {}, right {} %; now {}, {} %, of the right ones {} %".format(name, *cells))
+    return "\n".join(lines)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = done, 2 = a file or option that cannot be used."""
     parser = study_parser("without_intrinsics", __doc__)
     parser.add_argument("bundles", metavar="BUNDLES", type=Path, nargs="?", help="scene bundles; none = made-up pairs")
     parser.add_argument("--zooms", type=float, nargs="+", default=[1.0, 0.6, 1.6], help="default 1 0.6 1.6")
     parser.add_argument("--pairs", type=int, default=30, help="made-up pairs a row (default 30)")
+    parser.add_argument("--fit", action="store_true", help="fit the confidence anew, on bundles")
     return run_study(run, parser.parse_args(arguments))
 
 
 def run(options: argparse.Namespace) -> int:
     """Print a row for each zoom as it is measured, all on the same pairs."""
+    if options.fit and options.bundles is None:
+        raise ValueError("--fit: made-up pairs are all right, it needs scene bundles")
     filters = MatchFilter(model=options.model), MatchFilter(model=options.model, geometry="fundamental")
     if options.bundles is not None:
-        pairs = list(iterate_pairs(drawn_pairs(options)))
+        scenes = sound_scenes(options.bundles)
+        pairs = list(iterate_pairs(select_pairs(options.bundles, scenes, options.per_scene, options.seed)))
+    everything: list[Outcome] = []
     print(markdown_head(HEADER))
     for zoom in options.zooms:
         if options.bundles is None:
             drawn = [make_pair(seed, zoom) for seed in range(options.seed, options.seed + options.pairs)]
         else:
             drawn = [zoomed(pair, zoom) for pair in pairs]
-        print(markdown_row(cells(zoom, [run_pair(pair, *filters) for pair in drawn])), flush=True)
+        outcomes = [run_pair(pair, zoom, *filters) for pair in drawn]
+        everything += outcomes
+        print(markdown_row(cells(zoom, outcomes)), flush=True)
+    if options.fit:
+        print("\n" + describe_fit(everything, filters[0].metadata.choice["verdict"][1]))
     return 0
 
 

@@ -31,7 +31,8 @@ _SIGMA_FACTOR, _LEAST_SIGMA = 3.0, 0.04
 # Nobody zooms by more, usually: standard deviation of the logarithm of the ratio of which matches tell nothing.
 _LARGEST_RATIO_SIGMA = 0.5
 # How often a pose is within 10 degrees of the truth, by the log odds of the fit's confidence, which takes the focal
-# lengths for known, and the logarithm of the degrees by which they leave it open: `benchmarks/without_intrinsics.py --fit`.
+# lengths for known, and the logarithm of the degrees by which they leave it open: weights and offset, which
+# `python -m benchmarks.without_intrinsics TRAIN --fit` finds.
 _ODDS_WEIGHT, _SIGMA_WEIGHT, _OFFSET = 0.62, -0.88, 0.33
 _LEAST_SIGMA_DEG, _LARGEST_SIGMA_DEG = 0.05, 180.0
 _LEAST_CONFIDENCE = 1e-3

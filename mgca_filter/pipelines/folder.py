@@ -246,9 +246,10 @@ def write_json_lines(path: Path, read: ReadFeatures, rows: Iterable[PairRow]) ->
     """One JSON object per pair, in the order of the names.
 
     Keys: ``image1``, ``image2``, ``status``, ``num_matches``, ``num_inliers``, ``calibrated``, ``confidence``,
-    ``verified`` (the kept matches may be used, whatever the pose is worth), ``E``, ``F``, ``H``, ``R``, ``t`` (null where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and
-    ``scores`` (K,) of the kept matches, ``message`` for a pair that failed. Pixels, and the geometry between them, are
-    those of the photographs as their EXIF says that they are to be shown.
+    ``verified`` (the kept matches may be used, whatever the pose is worth), ``E``, ``F``, ``H``, ``R``, ``t`` (null
+    where there is none; X2 = R X1 + t), ``points1``, ``points2`` (K, 2) pixels and ``scores`` (K,) of the kept matches,
+    ``message`` for a pair that failed. Pixels, and the geometry between them, are those of the photographs as their
+    EXIF says that they are to be shown.
     """
     with path.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(document, allow_nan=False) + "\n" for document in _documents(read, rows))
