@@ -170,31 +170,31 @@ def _error_with_true_K(result: FilterResult, pair: ScenePair) -> float:
     return FAILURE_DEG if pose is None else pose_error_deg(*pose, pair.R, pair.t)
 
 
-HEADER = [
-    "zoom",
-    "pairs",
-    "R, t mAP@20",
-    "its F with the true K",
-    "F alone with the true K",
-    "guessed focal length",
-    "ok if known",
-    f"of these within {RIGHT_DEG:g}°",
-    "ok",
-    f"of these within {RIGHT_DEG:g}°",
-    "right ones left, %",
-    "verified",
-    "matches kept",
-] + [*("estimated", "two found", "focal error, %", "within 1 sigma, %", "within 2, %")]
+POSES = ["zoom", "pairs", "R, t mAP@20", "its F with the true K", "F alone with the true K", "guessed focal length"]
+VERDICTS = [
+    *("zoom", "ok if known", f"of these within {RIGHT_DEG:g}°", "ok", f"of these within {RIGHT_DEG:g}°"),
+    *("right ones left, %", "verified", "matches kept"),
+]
+FOCALS = ["zoom", "estimated", "two found", "error, %", "within 1 sigma, %", "within 2, %"]
 
 
-def cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
-    """A row: accuracies in per cent, the median error of the focal lengths, and how often it lies within sigmas."""
+def pose_cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
+    """A row of accuracies, per cent."""
     kinds = ([getattr(o, name) for o in outcomes] for name in ("pose", "own_F", "with_true_K", "guessed"))
-    row = [f"{zoom:g}", str(len(outcomes)), *(f"{100 * mean_average_precision(errors, 20):.1f}" for errors in kinds)]
-    row += _counts([o for o in outcomes if o.ok_if_known], [o for o in outcomes if o.ok])
-    row += [str(sum(o.verified for o in outcomes)), str(sum(o.kept for o in outcomes))]
+    accuracies = (f"{100 * mean_average_precision(errors, 20):.1f}" for errors in kinds)
+    return [f"{zoom:g}", str(len(outcomes)), *accuracies]
+
+
+def verdict_cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
+    """A row of what the filter says of its answers: before and after the focal lengths' uncertainty has its say."""
+    row = _counts([o for o in outcomes if o.ok_if_known], [o for o in outcomes if o.ok])
+    return [f"{zoom:g}", *row, str(sum(o.verified for o in outcomes)), str(sum(o.kept for o in outcomes))]
+
+
+def focal_cells(zoom: float, outcomes: Sequence[Outcome]) -> list[str]:
+    """A row of the focal lengths: their median error, and how often it lies within what is said of them."""
     known = [(o.errors, o.sigmas) for o in outcomes if o.errors is not None and o.sigmas is not None]
-    row += [str(len(known)), str(sum(o.two for o in outcomes))]
+    row = [f"{zoom:g}", str(len(known)), str(sum(o.two for o in outcomes))]
     if not known:
         return [*row, "", "", ""]
     errors, sigmas = (np.concatenate(values) for values in zip(*known))
@@ -234,10 +234,14 @@ def describe_fit(outcomes: Sequence[Outcome], usable: float) -> str:
         lines.append(markdown_row([*row, f"{right[before].mean() if before.any() else 0:.2f}"]))
     for zoom in (*sorted({o.zoom for o in judged}), None):
         rows = [k for k, o in enumerate(judged) if (zoom is None or o.zoom == zoom) and o.ok_if_known]
-        cells = _counts([judged[k] for k in rows], [judged[k] for k in rows if confidence[k] >= usable])
+        counts = _counts([judged[k] for k in rows], [judged[k] for k in rows if confidence[k] >= usable])
         name = "all" if zoom is None else f"zoom {zoom:g}"
-        lines.append("{}: ok {}, right {} %; now {}, {} %, of the right ones {} %".format(name, *cells))
+        lines.append("{}: ok {}, right {} %; now {}, {} %, of the right ones {} %".format(name, *counts))
     return "\n".join(lines)
+
+
+def _table(header: list[str], rows: Sequence[list[str]]) -> str:
+    return "\n".join([markdown_head(header), *map(markdown_row, rows)])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -251,25 +255,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Print a row for each zoom as it is measured, all on the same pairs."""
+    """Print a row for each zoom in each of three tables, all on the same pairs."""
     if options.fit and options.bundles is None:
         raise ValueError("--fit: made-up pairs are all right, it needs scene bundles")
     filters = MatchFilter(model=options.model), MatchFilter(model=options.model, geometry="fundamental")
     if options.bundles is not None:
         scenes = sound_scenes(options.bundles)
         pairs = list(iterate_pairs(select_pairs(options.bundles, scenes, options.per_scene, options.seed)))
-    everything: list[Outcome] = []
-    print(markdown_head(HEADER))
+    rows: dict[float, list[Outcome]] = {}
     for zoom in options.zooms:
         if options.bundles is None:
             drawn = [make_pair(seed, zoom) for seed in range(options.seed, options.seed + options.pairs)]
         else:
             drawn = [zoomed(pair, zoom) for pair in pairs]
-        outcomes = [run_pair(pair, zoom, *filters) for pair in drawn]
-        everything += outcomes
-        print(markdown_row(cells(zoom, outcomes)), flush=True)
+        rows[zoom] = [run_pair(pair, zoom, *filters) for pair in drawn]
+    tables = ((POSES, pose_cells), (VERDICTS, verdict_cells), (FOCALS, focal_cells))
+    print("\n\n".join(_table(header, [cells(*row) for row in rows.items()]) for header, cells in tables))
     if options.fit:
-        print("\n" + describe_fit(everything, filters[0].metadata.choice["verdict"][1]))
+        print(
+            "\n"
+            + describe_fit(
+                [outcome for row in rows.values() for outcome in row], filters[0].metadata.choice["verdict"][1]
+            )
+        )
     return 0
 
 

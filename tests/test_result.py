@@ -49,6 +49,19 @@ def test_a_result_is_true_where_its_geometry_may_be_used(match_filter, result):
     assert not few
 
 
+@pytest.mark.parametrize("status", Status)
+@pytest.mark.parametrize("info", [{}, {"focal_doubt": True}])
+def test_matches_are_verified_where_a_model_explains_them(status, info):
+    """That of a pose which focal lengths alone make doubtful is such a model."""
+    nothing = dict.fromkeys(("E", "F", "R", "t", "H"))
+    answer = FilterResult(
+        np.ones(9, bool), np.ones(9, np.float32), [], **nothing, status=status, num_inliers=9, info=info
+    )
+    explained = {Status.OK, Status.PLANAR, Status.PURE_ROTATION}
+    assert answer.verified == (status in explained or bool(info))
+    assert answer.ok <= answer.verified
+
+
 def test_repr_fits_a_line(match_filter, result):
     image = np.random.default_rng(0).integers(0, 255, (240, 320), dtype=np.uint8)
     matched = match_images(image, image, max_keypoints=50, model=match_filter._backend._path)

@@ -78,3 +78,33 @@ def test_where_two_focal_lengths_fail_one_is_tried(match_filter: MatchFilter, mo
     result = run(match_filter, scene)
     assert result.info["focal_px"] == pytest.approx((K[0, 0], K[0, 0]))
     assert pose_error_deg(result.R, result.t, scene.R, scene.t) < 1.0
+
+
+def test_a_pose_is_no_surer_than_its_focal_lengths(match_filter: MatchFilter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they leave the pose open it is doubtful; mask, F and the pose itself are what they were."""
+    scene = make_scene("skew", right=300, wrong=60)
+    sure = run(match_filter, scene)
+    assert (sure.status, sure.ok, sure.verified) == (Status.OK, True, True)
+    assert 0.0 < sure.info["focal_sigma_deg"] < 5.0
+    assert sure.confidence < sure.info["fitted_confidence"]
+    assert "focal_doubt" not in sure.info
+    monkeypatch.setattr(match_filter_module, "pose_sigma_deg", lambda *arguments: 40.0)
+    unsure = run(match_filter, scene)
+    assert (unsure.status, unsure.ok, unsure.verified) == (Status.LOW_SUPPORT, False, True)
+    assert unsure.info["focal_sigma_deg"] == 40.0
+    assert unsure.info["focal_doubt"] is True
+    assert unsure.confidence < 0.5
+    assert unsure.info["fitted_confidence"] == sure.info["fitted_confidence"]
+    for name in ("mask", "F", "E", "R", "t"):
+        np.testing.assert_array_equal(getattr(unsure, name), getattr(sure, name))
+
+
+def test_known_focal_lengths_leave_nothing_open(match_filter: MatchFilter) -> None:
+    result = run(match_filter, make_scene("skew", right=300, wrong=60), K1=K)
+    assert result.ok
+    assert not {"focal_sigma_deg", "fitted_confidence", "focal_doubt"} & set(result.info)
+
+
+def test_the_noisier_the_matches_the_more_open_is_the_pose(match_filter: MatchFilter) -> None:
+    quiet, noisy = (run(match_filter, make_scene("general", right=300, wrong=0, noise_px=px)) for px in (0.1, 0.8))
+    assert quiet.info["focal_sigma_deg"] < noisy.info["focal_sigma_deg"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,10 +59,44 @@ def test_made_up_pairs_obey_their_cameras(zoom: float) -> None:
 
 def test_a_row_without_intrinsics(match_filter: MatchFilter) -> None:
     pair = without_intrinsics.make_pair(4, 1.6)
-    free = MatchFilter.over(
-        match_filter._backend, without_intrinsics.replace(match_filter.options, geometry="fundamental")
-    )
-    row = without_intrinsics.cells(1.6, [without_intrinsics.run_pair(pair, match_filter, free)])
-    assert len(row) == len(without_intrinsics.HEADER)
-    assert float(row[2]) == 100.0
-    assert row[7:9] == ["1", "1"]
+    free = MatchFilter.over(match_filter._backend, replace(match_filter.options, geometry="fundamental"))
+    outcomes = [without_intrinsics.run_pair(pair, 1.6, match_filter, free)]
+    poses = without_intrinsics.pose_cells(1.6, outcomes)
+    verdicts = without_intrinsics.verdict_cells(1.6, outcomes)
+    focals = without_intrinsics.focal_cells(1.6, outcomes)
+    for row, header in (
+        (poses, without_intrinsics.POSES),
+        (verdicts, without_intrinsics.VERDICTS),
+        (focals, without_intrinsics.FOCALS),
+    ):
+        assert len(row) == len(header)
+    assert poses[1:4] == ["1", "100.0", "100.0"]
+    assert verdicts[1:7] == ["1", "100.0", "1", "100.0", "100", "1"]
+    assert int(verdicts[7]) > 250
+    assert focals[1:3] == ["1", "1"]
+
+
+def test_what_focal_lengths_alone_make_doubtful_is_counted_before_and_after(match_filter: MatchFilter) -> None:
+    sure = without_intrinsics.run_pair(without_intrinsics.make_pair(4, 1.6), 1.6, match_filter, match_filter)
+    doubtful = replace(sure, status="low_support", pose=30.0)
+    row = without_intrinsics.verdict_cells(1.6, [sure, doubtful])
+    assert row[1:7] == ["2", "50.0", "1", "100.0", "100", "2"]
+    rejected = replace(doubtful, verified=False, kept=0)
+    assert without_intrinsics.verdict_cells(1.6, [sure, rejected])[1:7] == ["1", "100.0", "1", "100.0", "100", "1"]
+
+
+def test_the_fit_of_the_confidence_finds_what_the_answers_were_drawn_from(match_filter: MatchFilter) -> None:
+    rng = np.random.default_rng(0)
+    answer = without_intrinsics.run_pair(without_intrinsics.make_pair(4, 1.0), 1.0, match_filter, match_filter)
+    outcomes = []
+    for k in range(4000):
+        fitted, sigma_deg = rng.uniform(0.3, 0.99), np.exp(rng.uniform(-1, 3))
+        log_odds = 0.7 * np.log(fitted / (1 - fitted)) - 0.9 * np.log(sigma_deg) + 0.4
+        pose = 1.0 if rng.random() < 1 / (1 + np.exp(-log_odds)) else 90.0
+        known = {"fitted_confidence": fitted, "sigma_deg": sigma_deg}
+        outcomes.append(replace(answer, scene=str(k % 10), pose=pose, **known))
+    first = without_intrinsics.describe_fit(outcomes, 0.68).splitlines()[0]
+    found = [
+        float(word.rstrip(",")) for word in first.split() if word.rstrip(",").lstrip("-").replace(".", "").isdigit()
+    ]
+    np.testing.assert_allclose(found, [0.7, -0.9, 0.4], atol=0.15)

@@ -25,7 +25,8 @@ IMAGES = ROOT / "examples" / "images"
 LEFT, RIGHT = str(IMAGES / "left.jpg"), str(IMAGES / "right.jpg")
 K_WORDS = "820,820,511.5,383.5"
 JSON_KEYS = {
-    "version", "image1", "image2", "status", "confidence", "num_matches", "num_inliers", "E", "F", "R", "t", "H",
+    "version", "image1", "image2", "status", "confidence", "verified", "num_matches", "num_inliers",
+    "E", "F", "R", "t", "H",
     "K1", "K2", "dist1", "dist2", "homography", "intrinsics", "focal_px", "assumptions", "backend", "model",
     "model_sha256", "timings_ms", "kept",
 }  # fmt: skip

@@ -249,6 +249,10 @@ def test_advice_depends_on_what_is_known():
     assert (sure.tone, unsure.tone) == ("good", "caution")
     assert "93 %" in sure.advice
     assert "only 21 %" in unsure.advice
+    doubtful = describe_verdict("low_support", focal_doubt=True)
+    assert doubtful.tone == "caution"
+    assert "Use the kept matches" in doubtful.advice
+    assert "--K" in doubtful.advice
     assert describe_verdict("new_word").headline == "The filter's verdict is new word."
 
 

@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from dataclasses import replace
 
 import fisheye_views
 import multi_view
@@ -226,6 +227,12 @@ def test_configuration_follows_status():
     assert colmap.two_view_geometry(row("planar", calibrated=False)).config == CONFIGURATION.PLANAR_OR_PANORAMIC
     for status in ("unrelated", "low_support", "no_geometry", "too_few_matches", "failed"):
         assert colmap.two_view_geometry(row(status)).config == CONFIGURATION.DEGENERATE
+    # Focal lengths alone make the pose doubtful: the matches are kept, and there is nothing else to write.
+    kept = replace(row("low_support", calibrated=False, F=np.eye(3)), kept=np.zeros((9, 2), np.uint32))
+    verified = colmap.two_view_geometry(kept)
+    assert verified.config == CONFIGURATION.UNCALIBRATED
+    assert len(verified.inlier_matches) == 9
+    assert colmap.two_view_geometry(replace(kept, calibrated=True)).config == CONFIGURATION.DEGENERATE
     point = np.array([10.0, 20.0, 1.0])  # COLMAP's pixel; half a pixel less in OpenCV's
     there, expected = planar.H @ point, H @ (point - [0.5, 0.5, 0.0])
     np.testing.assert_allclose(there[:2] / there[2], expected[:2] / expected[2] + 0.5)
