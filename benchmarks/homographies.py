@@ -2,16 +2,16 @@
 
 Photographs of scikit-image are warped by known homographies, with noise, blur and another brightness, and matched by
 real keypoints; the error is the mean distance of the four corners of image 1 in image 2, pixels. ``--decision``
-measures instead how often one homography is claimed for unrelated photographs, and found for small objects.
+measures instead how often one homography is claimed for unrelated photographs, and found for small objects: by
+``geometry="homography"``, and by the answer of a filter that is not told what to look for.
 
-    python benchmarks/homographies.py --kind warp --pairs 60 --detector sift
-    python benchmarks/homographies.py --decision
+    python -m benchmarks.homographies --kind warp --pairs 60 --detector sift
+    python -m benchmarks.homographies --decision
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -30,6 +30,7 @@ from mgca_filter.geometry.homography import scaled_homography, transfer
 from mgca_filter.inputs.attributes import Column
 from mgca_filter.inputs.pair import MatchPair, prepare_pair
 from mgca_filter.opencv.twins import findHomography
+from mgca_filter.tables import markdown_head, markdown_row
 
 Array = NDArray[np.float64]
 
@@ -303,63 +304,57 @@ def auc(errors: Array, limit: float) -> float:
     return float(np.mean(np.clip(1.0 - errors / limit, 0.0, 1.0)))
 
 
+HEADER = ["matches, estimator", "AUC@3", "AUC@5", "AUC@10", "within 5 px, %", "AUC@5, difference with 95 % interval"]
+DECISIONS = ["pairs", "list", "claimed", "right", "fit alone right", "answer verified", "with a right H", "without H"]
+
+
 def run_rows(kind: str, pairs: int, detector: str, first_seed: int, words: Sequence[str]) -> None:
     """Print the table of one kind."""
     chosen = {name: row for name, row in ROWS.items() if not words or any(word in name for word in words)}
     errors: dict[str, list[float]] = {name: [] for name in chosen}
-    ms: dict[str, list[float]] = {name: [] for name in chosen}
     for seed in range(first_seed, first_seed + pairs):
         pair = make_pair(kind, seed, detector)
         _scores.clear()
         _answers.clear()
         for name, (matches, estimate) in chosen.items():
-            if "kept" in name:
-                answered(pair, matches)  # which takes its time once
-            if name.split(", ")[1] != "twin" and ("ours" in name or "scores" in name):
-                scored(pair, matches)  # the network is timed by other benchmarks
-            started = time.perf_counter()
             H = estimate(pair, matches)
-            ms[name].append(1e3 * (time.perf_counter() - started))
             errors[name].append(pair.corner_error_px(None if H is None else scaled_homography(H)))
     draws = np.random.default_rng(0).integers(0, pairs, (BOOTSTRAP_DRAWS, pairs))
-    print(f"\n{kind}, {detector}, {pairs} pairs; difference in AUC@5 to '{REFERENCE}' with 95 % interval")
-    print(f"{'':28s}  AUC@3  AUC@5 AUC@10   <5px  difference            ms")
+    print(f"\n{pairs} pairs of kind {kind}, {detector}; differences to '{REFERENCE}':\n")
+    print(markdown_head(HEADER))
     base = np.array(errors.get(REFERENCE, np.full(pairs, np.inf)))
     for name, values in errors.items():
         own = np.array(values)
         gain = np.clip(1 - own / RIGHT_PX, 0, 1) - np.clip(1 - base / RIGHT_PX, 0, 1)
         low, high = np.percentile(gain[draws].mean(axis=1), [2.5, 97.5])
-        numbers = " ".join(f"{100 * auc(own, limit):6.1f}" for limit in AUC_PX)
-        share = 100 * np.mean(own < RIGHT_PX)
-        interval = f"{100 * gain.mean():+6.1f} [{100 * low:+6.1f}, {100 * high:+6.1f}]"
-        print(f"{name:28s} {numbers} {share:6.1f}  {interval} {np.median(ms[name]):7.1f}")
+        numbers = [f"{100 * auc(own, limit):.1f}" for limit in AUC_PX]
+        interval = f"{100 * gain.mean():+.1f} [{100 * low:+.1f}, {100 * high:+.1f}]"
+        print(markdown_row([name, *numbers, f"{100 * np.mean(own < RIGHT_PX):.1f}", interval]), flush=True)
 
 
 def run_decision(pairs: int, detector: str, first_seed: int) -> None:
     """Print how often a homography is claimed for unrelated photographs and found for small objects."""
-    print(f"\ndecision, {detector}, {pairs} pairs each: claimed / right within {RIGHT_PX:g} px, percent")
+    print(f"{pairs} pairs a row, {detector}; right within {RIGHT_PX:g} px, per cent:\n")
+    print(markdown_head(DECISIONS))
     for kind in ("unrelated", "object", "warp"):
         for name in ("raw", f"ratio {RATIO}", f"ratio {TUTORIAL_RATIO}", "cross"):
-            claimed, right, found_by_fit = 0, 0, 0
-            values = []
+            counts = np.zeros(len(DECISIONS) - 2)
             for seed in range(first_seed, first_seed + pairs):
-                pair = make_pair(kind, seed, detector)
-                _scores.clear()
-                scores, order, frames = scored(pair, name)
-                found = find_plane(
-                    np.hstack(pair.points(name)), scores, pair.size1, pair.size2, order=order, frames=frames
-                )
-                values.append(found.log10_false_alarms)
-                close = pair.corner_error_px(found.H) < RIGHT_PX
-                claimed += found.meaningful
-                right += found.meaningful and close
-                found_by_fit += close
-            spread = " ".join(
-                f"{value:.1f}" for value in np.percentile(np.minimum(values, 99.0), [0, 5, 25, 50, 75, 100])
-            )
-            share = [100 * count / pairs for count in (claimed, right, found_by_fit)]
-            print(f"{kind:10s} {name:10s} claimed {share[0]:5.1f} right {share[1]:5.1f} "
-                  f"(fit alone {share[2]:5.1f})  log10 NFA 0/5/25/50/75/100 %: {spread}", flush=True)  # fmt: skip
+                counts += _decide(make_pair(kind, seed, detector), name)
+            print(markdown_row([kind, name, *(f"{100 * count / pairs:.1f}" for count in counts)]), flush=True)
+
+
+def _decide(pair: Pair, name: str) -> list[bool]:
+    """The columns of :data:`DECISIONS` for one list."""
+    _scores.clear()
+    _answers.clear()
+    scores, order, frames = scored(pair, name)
+    found = find_plane(np.hstack(pair.points(name)), scores, pair.size1, pair.size2, order=order, frames=frames)
+    close = pair.corner_error_px(found.H) < RIGHT_PX
+    result = answered(pair, name)
+    right = pair.corner_error_px(result.H) < RIGHT_PX
+    without = result.verified and result.H is None
+    return [found.meaningful, found.meaningful and close, close, result.verified, result.verified and right, without]
 
 
 def main() -> None:

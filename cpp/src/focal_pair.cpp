@@ -22,6 +22,7 @@ constexpr double kMinRatioSigmas = 2.0;
 // Zooms between the images that refinement starts from, beside that of the shared focal length.
 constexpr std::array<double, 4> kZooms{0.4, 0.63, 1.6, 2.5};
 constexpr int kMaxRounds = 25;
+constexpr double kLeastDamping = 1e-9;  // without any few matches leave a matrix that has no inverse
 constexpr double kLargestDamping = 1e4, kConvergedAt = 1e-5;
 constexpr double kDerivativeStep = 1e-6;
 constexpr double kLargestStep = 0.3;
@@ -47,15 +48,15 @@ std::pair<std::optional<TwoFocals>, double> FocalPairFit::differing(const Pose& 
     const double before = cost(distances(shared), shared.logs);
     TwoFocals found = refined(shared);
     const double sigma_beside = found.ratio_sigma;
-    if (before - found.cost < kMinGain) {
-        return {std::nullopt, sigma_beside};
-    }
     for (const double zoom : kZooms) {
         const double half = 0.5 * std::log(zoom);
         const TwoFocals other = refined({pose, {log_factor - half, log_factor + half}});
         if (other.cost < found.cost) {
             found = other;
         }
+    }
+    if (before - found.cost < kMinGain) {
+        return {std::nullopt, sigma_beside};
     }
     const double apart = std::abs(found.logs[1] - found.logs[0]);
     const bool believed = apart > std::max(kMinLogRatio, kMinRatioSigmas * found.ratio_sigma);
@@ -102,7 +103,7 @@ TwoFocals FocalPairFit::refined(State state) const {
                 state = candidate;
                 distance = candidate_distance;
                 now = candidate_cost;
-                damping *= 0.1;
+                damping = std::max(0.1 * damping, kLeastDamping);
                 break;
             }
         }
@@ -110,8 +111,8 @@ TwoFocals FocalPairFit::refined(State state) const {
             break;
         }
     }
-    const cv::Matx<double, 7, 7> hessian =
-        normal_equations(state, distance).hessian + 1e-9 * cv::Matx<double, 7, 7>::eye();
+    cv::Matx<double, 7, 7> hessian = normal_equations(state, distance).hessian;
+    hessian += (1e-9 + 1e-12 * cv::trace(hessian)) * cv::Matx<double, 7, 7>::eye();
     const cv::Matx<double, 7, 7> covariance = hessian.inv(cv::DECOMP_LU);
     const auto sigma = [](double variance) { return kCurvatureToSigma * std::sqrt(std::max(variance, 0.0)); };
     const double first = covariance(5, 5), second = covariance(6, 6);

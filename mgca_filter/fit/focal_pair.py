@@ -28,7 +28,8 @@ MIN_RATIO_SIGMAS = 2.0
 # Zooms between the images that refinement starts from, beside that of the shared focal length.
 _ZOOMS = (0.4, 0.63, 1.6, 2.5)
 _ROUNDS = 25
-_MAX_DAMPING, _CONVERGED_DECREASE = 1e4, 1e-5
+# Without any damping few matches leave a matrix that has no inverse.
+_LEAST_DAMPING, _MAX_DAMPING, _CONVERGED_DECREASE = 1e-9, 1e4, 1e-5
 _DIFFERENCE = 1e-6
 _LARGEST_STEP = 0.3
 _LARGEST_LOG = 2.3
@@ -96,13 +97,13 @@ class FocalPairFit:
         shared = np.array([log_factor, log_factor])
         before = self._cost(self._distances(R, t, shared), shared)
         beside = found = self._refined(R, t, shared)
-        if before - found.cost < MIN_GAIN:
-            return None, beside.ratio_sigma
         for zoom in _ZOOMS:
             half = 0.5 * np.log(zoom)
             other = self._refined(R, t, shared + np.array([-half, half]))
             if other.cost < found.cost:
                 found = other
+        if before - found.cost < MIN_GAIN:
+            return None, beside.ratio_sigma
         apart = abs(found.log_ratio) > max(MIN_LOG_RATIO, MIN_RATIO_SIGMAS * found.ratio_sigma)
         return found if apart else None, beside.ratio_sigma
 
@@ -135,13 +136,14 @@ class FocalPairFit:
                 new_cost = self._cost(new_distance, moved[2])
                 if new_cost < cost:
                     (R, t, logs), distance, cost = moved, new_distance, new_cost
-                    damping *= 0.1
+                    damping = max(0.1 * damping, _LEAST_DAMPING)
                     break
                 damping *= 10.0
             if cost > previous - _CONVERGED_DECREASE * max(previous, 1.0):
                 break
         hessian, _ = self._normal_equations(R, t, logs, distance)
-        covariance = np.linalg.inv(hessian + 1e-9 * np.eye(7))[5:, 5:]
+        floor = 1e-9 + 1e-12 * float(np.trace(hessian))
+        covariance = np.linalg.inv(hessian + floor * np.eye(7))[5:, 5:]
         directions = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]])
         variances = np.einsum("ij,jk,ik->i", directions, covariance, directions)
         sigmas = _SIGMA_FACTOR * np.sqrt(np.maximum(variances, 0.0))

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import fisheye, small_motion, without_intrinsics
 from mgca_filter import MatchFilter
-from mgca_filter.geometry.epipolar import essential_from_pose, sampson_distance
+from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg, sampson_distance
 
 
 def normalized(points: np.ndarray, K: np.ndarray) -> np.ndarray:
@@ -74,6 +74,19 @@ def test_a_row_without_intrinsics(match_filter: MatchFilter) -> None:
     assert verdicts[1:7] == ["1", "100.0", "1", "100.0", "100", "1"]
     assert int(verdicts[7]) > 250
     assert focals[1:3] == ["1", "1"]
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_two_cameras_are_told_apart_wherever_the_search_starts(match_filter: MatchFilter, seed: int) -> None:
+    """Of two the shared focal length is a poor start: refinement from there may stand still."""
+    pair = without_intrinsics.make_pair(seed, 1.6)
+    bare = without_intrinsics.match_pair(pair)
+    result = match_filter.filter(
+        bare.kp1, bare.kp2, None, attributes=pair.attributes, size1=pair.image_size1, size2=pair.image_size2
+    )
+    focal1, focal2 = result.info["focal_px"]
+    assert np.log(focal2 / focal1) == pytest.approx(np.log(1.6), abs=0.2)
+    assert pose_error_deg(result.R, result.t, pair.R, pair.t) < 3.0
 
 
 def test_what_focal_lengths_alone_make_doubtful_is_counted_before_and_after(match_filter: MatchFilter) -> None:

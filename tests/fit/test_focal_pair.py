@@ -104,3 +104,15 @@ def test_rotation_alone_starts_nothing() -> None:
     """Degenerate starts do not raise."""
     points = make_scene(right=40, wrong=0).points1
     assert fitted(points, points, rotation_from_vector(np.zeros(3)), np.array([0.0, 0.0, 1.0]), 0.0, 0.3) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_matches_that_leave_most_of_it_open_do_not_raise(seed: int) -> None:
+    """Five different ones, more sharply seen than any: nothing bounds the steps but their damping."""
+    scene = make_scene("skew", right=40, wrong=0)
+    rows = np.hstack([scene.points1 - K[:2, 2], scene.points2 - K[:2, 2]]) / GUESS
+    few = np.repeat(rows[np.random.default_rng(seed).choice(len(rows), 5, replace=False)], 2, axis=0)
+    found, ratio_sigma = FocalPairFit(few, 2e-3, 1e-7, BELIEF).differing(scene.R, scene.t, 0.0)
+    assert ratio_sigma > 0.0
+    assert found is None or np.isfinite(found.logs).all()
+    assert np.isfinite(FocalPairFit(few, np.inf, 1.0, BELIEF).pose_derivative(scene.R, scene.t)).all()
