@@ -310,7 +310,10 @@ DECISIONS = ["pairs", "list", "claimed", "right", "fit alone right", "answer ver
 
 def run_rows(kind: str, pairs: int, detector: str, first_seed: int, words: Sequence[str]) -> None:
     """Print the table of one kind."""
-    chosen = {name: row for name, row in ROWS.items() if not words or any(word in name for word in words)}
+    parts = [word for word in words if word not in ROWS]
+    chosen = {
+        name: row for name, row in ROWS.items() if not words or name in words or any(part in name for part in parts)
+    }
     errors: dict[str, list[float]] = {name: [] for name in chosen}
     for seed in range(first_seed, first_seed + pairs):
         pair = make_pair(kind, seed, detector)
@@ -364,7 +367,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=40)
     parser.add_argument("--detector", default="sift", help="sift, orb or akaze")
     parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--rows", nargs="*", default=[], help="only rows whose name contains one of these")
+    parser.add_argument("--rows", nargs="*", default=[], help="only rows whose name is, or contains, one of these")
     parser.add_argument("--decision", action="store_true", help="the decision instead of the accuracy")
     options = parser.parse_args()
     if options.decision:

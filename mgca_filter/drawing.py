@@ -91,6 +91,23 @@ def draw_before_after(
     return np.vstack([above, rule, below])
 
 
+def draw_overlay(image1: Image, image2: Image, H: ArrayLike) -> Image:
+    """Image 1 as the homography ``H`` (3, 3), ``p2 ~ H p1``, brings it onto image 2, half transparent over it.
+
+    Images as of :func:`draw_matches`. Returns (h2, w2, 3) uint8 BGR, in the pixels of image 2; where image 1 does not
+    reach, image 2 alone.
+
+    Raises:
+        ValueError: an image is empty or no uint8 image.
+    """
+    first, second = as_bgr(image1, "image1"), as_bgr(image2, "image2")
+    size, matrix = (second.shape[1], second.shape[0]), np.asarray(H, dtype=np.float64)
+    warped = cv2.warpPerspective(first, matrix, size)
+    reached = cv2.warpPerspective(np.full(first.shape[:2], 255, np.uint8), matrix, size) > 127
+    mixed = cv2.addWeighted(warped, 0.5, second, 0.5, 0.0)
+    return np.asarray(np.where(reached[..., None], mixed, second), dtype=np.uint8)
+
+
 def caption(width: int, words: str) -> Image:
     """A strip (h, width, 3) uint8 BGR with words, to stand above or below a picture."""
     strip = np.full((HEADER_PX, width, 3), _BACKGROUND, np.uint8)

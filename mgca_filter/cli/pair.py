@@ -49,7 +49,7 @@ from .arguments import (
 from .cameras import camera as camera_argument
 from .cameras import camera_as_shown, distortion
 from .compare import BaselineFit, comparison_table, fit_baselines
-from .report import MatchReport, picture, summary, to_json, write_html, write_npz
+from .report import MatchReport, overlay, picture, summary, to_json, write_html, write_npz
 from .truth import existing, read_truth
 
 _USAGE = """\
@@ -71,7 +71,8 @@ Pixels are those of the image as it is shown: a photo that its EXIF says to turn
 as it is shown or as it is stored, whichever its principal point is the middle of.
 
 exit status: 0 = geometry found (status ok, planar, pure_rotation or suspicious_intrinsics: read which),
-1 = none (too_few_matches, no_geometry, low_support, unrelated), 2 = wrong usage or unreadable file."""
+1 = none (too_few_matches, no_geometry, unrelated, and low_support unless estimated focal lengths alone make the pose
+doubtful), 2 = wrong usage or unreadable file."""
 
 _log = logging.getLogger("mgca_filter")
 
@@ -89,6 +90,12 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("image2", metavar="img2", type=Path, help="relative to img1's: X2 = R X1 + t")
     out = parser.add_argument_group("output")
     out.add_argument("-o", "--output", metavar="OUT.png", type=Path, help="picture of kept and rejected matches")
+    out.add_argument(
+        "--overlay",
+        metavar="OUT.png",
+        type=Path,
+        help="picture of img1 warped onto img2, where there is a homography (--geometry homography asks for one)",
+    )
     out.add_argument("--json", metavar="FILE", help='pose, status and kept matches; "-" = alone on stdout')
     out.add_argument("--npz", metavar="FILE", type=Path, help="points, scores, mask and models as numpy arrays")
     out.add_argument("--html", metavar="FILE", type=Path, help="report to look at in a browser, one file")
@@ -157,19 +164,20 @@ def read_photo(path: Path) -> Photo:
 def _check_outputs(options: argparse.Namespace) -> None:
     """Complain about output paths before the work rather than after it."""
     json_path = None if options.json in (None, "-") else Path(options.json)
-    outputs = [path for path in (options.output, json_path, options.npz, options.html) if path is not None]
+    pictures = (options.output, options.overlay)
+    outputs = [path for path in (*pictures, json_path, options.npz, options.html) if path is not None]
     for path in outputs:
         if sum(other.resolve() == path.resolve() for other in outputs) > 1:
             raise UsageError(f"{path}: is asked for twice")
-    for path in (options.output, json_path, options.npz, options.html):
-        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+        if path.is_dir() or not path.parent.is_dir():
             raise UsageError(f"{path}: {'is a folder' if path.is_dir() else 'its folder does not exist'}")
-        if path is not None and path.resolve() in (options.image1.resolve(), options.image2.resolve()):
+        if path.resolve() in (options.image1.resolve(), options.image2.resolve()):
             raise UsageError(f"{path}: is one of the images")
-        if path is not None and options.truth is not None and path.resolve() == options.truth.resolve():
+        if options.truth is not None and path.resolve() == options.truth.resolve():
             raise UsageError(f"{path}: is the truth")
-    if options.output is not None and not (options.output.suffix and cv2.haveImageWriter(str(options.output))):
-        raise UsageError(f"{options.output}: OpenCV cannot write pictures of this type, use .png or .jpg")
+    for path in pictures:
+        if path is not None and not (path.suffix and cv2.haveImageWriter(str(path))):
+            raise UsageError(f"{path}: OpenCV cannot write pictures of this type, use .png or .jpg")
 
 
 @dataclass(frozen=True)
@@ -306,6 +314,12 @@ def _write(report: MatchReport, options: argparse.Namespace, command: str) -> No
             write_html(options.html, report, command)
     if options.output and not cv2.imwrite(str(options.output), picture(report)):
         raise UsageError(f"{options.output}: cannot be written")
+    if options.overlay:
+        warped = overlay(report)
+        if warped is None:
+            _log.warning("warning: --overlay: no homography was found, %s is not written", options.overlay)
+        elif not cv2.imwrite(str(options.overlay), warped):
+            raise UsageError(f"{options.overlay}: cannot be written")
 
 
 @contextmanager

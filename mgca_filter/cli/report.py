@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
-from ..drawing import Image, MatchPanel, draw_matches
+from ..drawing import Image, MatchPanel, draw_matches, draw_overlay
 from ..geometry.cameras import Distortion, Fisheye, Intrinsics, mean_focal_length, resolve_intrinsics
 from ..html_report import Truth, write_pair_report
 from ..match_images import ImageMatchResult
@@ -185,6 +185,16 @@ def picture(report: MatchReport) -> Image:
     facts = (f"{len(result.mask)} matches in", f"{result.num_inliers} kept", f"{report.total_ms:.0f} ms")
     panel = MatchPanel(result.mask, result.status.value, facts, success=result.status in _USABLE)
     return draw_matches(report.image1, report.image2, report.points1, report.points2, panel)
+
+
+def overlay(report: MatchReport) -> Image | None:
+    """Image 1 warped onto image 2 by the homography, both undistorted where lenses are known; None without one."""
+    if report.result.H is None:
+        return None
+    one, two = report.image1, report.image2
+    if report.dist1 is not None or report.dist2 is not None:
+        one, two = (_undistorted(image, camera) for image, camera in zip((one, two), report.cameras))
+    return draw_overlay(one, two, report.result.H)
 
 
 def to_json(report: MatchReport) -> str:

@@ -181,6 +181,26 @@ def test_picture_is_written(outputs):
     assert picture.shape[1] == 1600
 
 
+def test_the_overlay_shows_image_1_on_image_2(tmp_path, model_file, caplog):
+    """A photograph and itself, warped: the overlay is the second where the first reaches."""
+    photo = cv2.imread(LEFT)
+    height, width = photo.shape[:2]
+    H = np.array([[0.9, 0.05, 30], [-0.04, 0.92, 25], [1e-5, 2e-5, 1]])
+    other = cv2.warpPerspective(photo, H, (width, height))
+    cv2.imwrite(str(tmp_path / "other.png"), other)
+    words = ["--model", str(model_file), "--max-keypoints", "300", "-q", "--overlay", str(tmp_path / "over.png")]
+    assert cli.main([LEFT, str(tmp_path / "other.png"), *words, "--geometry", "homography"]) == 0
+    over = cv2.imread(str(tmp_path / "over.png"))
+    assert over.shape == other.shape
+    assert np.abs(over[150:-150, 150:-150].astype(int) - other[150:-150, 150:-150]).mean() < 3.0
+    (tmp_path / "over.png").unlink()
+    words.remove("-q")
+    assert cli.main([LEFT, RIGHT, *words, "--K", K_WORDS]) == 0
+    assert not (tmp_path / "over.png").exists()
+    assert "no homography was found" in caplog.text
+    assert cli.main([LEFT, RIGHT, "--overlay", str(tmp_path / "over.xyz")]) == 2
+
+
 def test_no_geometry_exits_with_1_and_still_writes(tmp_path, unrelated, model_file, capsys):
     files = ["-o", str(tmp_path / "m.png"), "--npz", str(tmp_path / "m.npz"), "--json", str(tmp_path / "m.json")]
     status = cli.main([LEFT, unrelated, "--model", str(model_file), "--max-keypoints", "300", "--compare", *files])
