@@ -25,7 +25,9 @@ constexpr double kSigmaFactor = 3.0, kLeastSigma = 0.04;
 constexpr double kLargestRatioSigma = 0.5;
 // How often a pose is within 10 degrees of the truth, by the log odds of the fit's confidence, which takes the focal
 // lengths for known, and the logarithm of the degrees by which they leave it open: focal_estimate.py.
-constexpr double kOddsWeight = 0.62, kSigmaWeight = -0.88, kOffset = 0.33;
+constexpr double kOddsWeight = 0.66, kSigmaWeight = -0.80, kOffset = 0.06;
+// From here on it is no more than even, whatever the fit says.
+constexpr double kEvenSigmaDeg = 10.0;
 constexpr double kLeastSigmaDeg = 0.05, kLargestSigmaDeg = 180.0;
 constexpr double kLeastConfidence = 1e-3;
 // Under a focal length far from the right one matches lie this far off before the pose is refined.
@@ -186,7 +188,8 @@ double pose_sigma_deg(const Evidence& evidence, const TwoViewModel& model, const
 double confidence_under_estimate(double confidence, double sigma_deg) {
     const double p = std::clamp(confidence, kLeastConfidence, 1.0 - kLeastConfidence);
     const double log_odds = kOddsWeight * std::log(p / (1.0 - p)) + kSigmaWeight * std::log(sigma_deg) + kOffset;
-    return std::min(confidence, 1.0 / (1.0 + std::exp(-log_odds)));
+    const double largest = sigma_deg < kEvenSigmaDeg ? confidence : std::min(confidence, 0.5);
+    return std::min(largest, 1.0 / (1.0 + std::exp(-log_odds)));
 }
 
 bool agrees_as_well(const Evidence& evidence, const TwoViewModel& model, const Evidence& free,
