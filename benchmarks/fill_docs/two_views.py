@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the commands that were asked for, all by default, and fill their places one by one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bundles", type=Path, help="scene bundles that training has not seen, for the first place")
-    parser.add_argument("--per-scene", type=int, default=60, help="at most so many pairs of each (default 60)")
+    parser.add_argument("--per-scene", type=int, default=24, help="at most so many pairs of each (default 24)")
     parser.add_argument("--only", nargs="+", choices=tuple(COMMANDS), metavar="PLACE", help="these places alone")
     options = parser.parse_args(arguments)
     names = options.only or tuple(COMMANDS)
