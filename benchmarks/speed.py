@@ -37,7 +37,7 @@ from mgca_filter.data.source import read_image
 from mgca_filter.evaluation.environment import CpuMeter, one_thread
 from mgca_filter.evaluation.metrics import FAILURE_DEG, true_matches
 from mgca_filter.evaluation.pairs import sample_pairs
-from mgca_filter.fit.evidence import MIN_MATCHES
+from mgca_filter.fit.evidence import FIRM_MATCHES
 from mgca_filter.fit.robust_fit import pose_from_essential
 from mgca_filter.geometry.cameras import mean_focal_length, normalize_points
 from mgca_filter.geometry.epipolar import essential_from_pose, pose_error_deg
@@ -303,7 +303,7 @@ def time_lists(
         ]
         for kind, selection in selections:
             for pair in sample_pairs([selection], len(selection)):
-                if len(pair.points1) >= MIN_MATCHES:
+                if len(pair.points1) >= FIRM_MATCHES:
                     times.append(time_list(match_filter, pair, kind.family, repeats))
     return times
 
