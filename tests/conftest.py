@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +27,16 @@ sys.path.append(str(Path(__file__).parent.parent))
 
 K = np.array([[800.0, 0.0, 319.5], [0.0, 800.0, 239.5], [0.0, 0.0, 1.0]])
 SIZE = (640, 480)
+
+
+@pytest.fixture(autouse=True)
+def package_log() -> Iterator[None]:
+    """What a command does to the package's log, such as ``--quiet``, ends with its test."""
+    log = logging.getLogger("mgca_filter")
+    level, handlers = log.level, log.handlers[:]
+    yield
+    log.setLevel(level)
+    log.handlers[:] = handlers
 
 
 @dataclass(frozen=True)
