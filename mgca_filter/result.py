@@ -37,6 +37,10 @@ class Status(str, enum.Enum):
         return format(self.value, spec)
 
 
+# With these a model explains the pair, pose and all; words are found among them as well.
+EXPLAINED = frozenset((Status.OK, Status.PLANAR, Status.PURE_ROTATION))
+
+
 @dataclass(frozen=True, eq=False)
 class FilterResult:
     """Answer of :func:`mgca_filter.filter_matches`; M is the number of matches that came in.
@@ -106,8 +110,7 @@ class FilterResult:
         With ``OK``, ``PLANAR`` and ``PURE_ROTATION``; and with ``LOW_SUPPORT`` where estimated focal lengths alone make
         the pose doubtful (``info["focal_doubt"]``), of which matches and F know nothing.
         """
-        explained = self.status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION)
-        return explained or bool(self.info.get("focal_doubt"))
+        return self.status in EXPLAINED or bool(self.info.get("focal_doubt"))
 
     def __bool__(self) -> bool:
         """As :attr:`ok`."""

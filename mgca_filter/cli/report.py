@@ -22,10 +22,8 @@ from ..result import FilterResult, Status
 from .compare import BaselineFit, describe_rotation, describe_translation
 from .truth import TruePose
 
-# Only these come with a pose that can be used as it is.
 # Relative standard deviation from which on an estimated focal length is none.
 _POOR_SIGMA = 0.3
-_USABLE = (Status.OK, Status.PLANAR)
 
 
 @dataclass(frozen=True)
@@ -183,7 +181,7 @@ def picture(report: MatchReport) -> Image:
     """Kept and rejected matches side by side, (H, W, 3) uint8."""
     result = report.result
     facts = (f"{len(result.mask)} matches in", f"{result.num_inliers} kept", f"{report.total_ms:.0f} ms")
-    panel = MatchPanel(result.mask, result.status.value, facts, success=result.status in _USABLE)
+    panel = MatchPanel(result.mask, result.status.value, facts, success=result.ok)
     return draw_matches(report.image1, report.image2, report.points1, report.points2, panel)
 
 

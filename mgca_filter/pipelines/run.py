@@ -25,9 +25,9 @@ from ..features import ImageFeatures
 from ..html_report.folder_report import PairLine, write_folder_report
 from ..inference.model_file import sha256_of
 from ..match_filter import MatchFilter, find_model
+from ..result import EXPLAINED
 from .journal import Journal, PipelineError, output_file
 from .worker import (
-    EXPLAINED,
     FAILED,
     PairRow,
     Unusable,

@@ -30,11 +30,9 @@ from ..images import decode_photo
 from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
-from ..result import FilterResult, Status
+from ..result import EXPLAINED, FilterResult, Status
 
 FAILED = "failed"
-# With these a model explains the pair, pose and all.
-EXPLAINED = frozenset(status.value for status in (Status.OK, Status.PLANAR, Status.PURE_ROTATION))
 
 
 @dataclass(frozen=True)
