@@ -69,6 +69,7 @@ VARIANTS = {
         _without("score order", "score order, all", "score order, fine", "score order, best"), early_end=False
     ),
     "without the twin under the plane": Variant(replace(PLAN, twins=False)),
+    "without the last refinement": Variant(replace(PLAN, last_refinement=False)),
     "PoseLib among the sources": Variant(replace(PLAN, second=(*PLAN.second, POSELIB))),
     "MAGSAC alone": Variant(options=FilterOptions(method="magsac"), early_end=False),
     "PROSAC alone": Variant(options=FilterOptions(method="prosac"), early_end=False),

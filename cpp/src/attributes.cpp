@@ -1,10 +1,20 @@
 #include "attributes.hpp"
 
+#include "degeneracy.hpp"
+
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 namespace mgca::detail {
+namespace {
+
+// A keypoint's noise grows with this power of its size; what is known of that is believed within these limits.
+constexpr double kNoisePower = 0.75;
+constexpr double kLeastNoise = 0.4, kLargestNoise = 3.0;
+
+}  // namespace
 
 std::vector<EncodedAttributes> encode_attributes(const Attributes& known, std::size_t count) {
     std::vector<EncodedAttributes> encoded(count, EncodedAttributes{});
@@ -35,6 +45,33 @@ std::vector<EncodedAttributes> encode_attributes(const Attributes& known, std::s
         }
     }
     return encoded;
+}
+
+std::vector<double> relative_noise(const Attributes& known, const Mask& valid) {
+    std::vector<double> noise(valid.size(), 1.0);
+    if (known.size1.empty() || known.size2.empty()) {
+        return noise;
+    }
+    std::vector<double> sizes(valid.size(), 0.0), usual;  // 0 = unknown
+    for (std::size_t i = 0; i < valid.size(); ++i) {
+        const double size1 = known.size1[i], size2 = known.size2[i];
+        if (size1 > 0 && size2 > 0 && std::isfinite(size1) && std::isfinite(size2)) {
+            sizes[i] = std::sqrt(0.5 * (size1 * size1 + size2 * size2));
+            if (valid[i] != 0) {
+                usual.push_back(sizes[i]);
+            }
+        }
+    }
+    if (usual.empty()) {
+        return noise;
+    }
+    const double middle = median(std::move(usual));
+    for (std::size_t i = 0; i < valid.size(); ++i) {
+        if (sizes[i] > 0) {
+            noise[i] = std::clamp(std::pow(sizes[i] / middle, kNoisePower), kLeastNoise, kLargestNoise);
+        }
+    }
+    return noise;
 }
 
 Mask candidate_mask(const std::vector<EncodedAttributes>& attributes, double max_ratio, int min_count) {

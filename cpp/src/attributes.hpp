@@ -33,6 +33,12 @@ using EncodedAttributes = std::array<float, kAttributeCount>;
 /// Network input of `count` matches.
 std::vector<EncodedAttributes> encode_attributes(const Attributes& known, std::size_t count);
 
+/// How noisy the position of each match is, the usual match of the list being 1; 1 where it is not known. A detector locates
+/// small keypoints better than large ones.
+///
+/// @param valid the matches that tell what is usual.
+std::vector<double> relative_noise(const Attributes& known, const Mask& valid);
+
 /// Matches worth the network's time: best of the list and of a ratio below the largest, as far as that is known; all, when
 /// fewer than the least number would remain.
 Mask candidate_mask(const std::vector<EncodedAttributes>& attributes, double max_ratio, int min_count);

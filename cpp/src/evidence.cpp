@@ -73,6 +73,7 @@ Evidence gather(const PairInput& pair, const Rows& ordered) {
     for (const std::size_t row : evidence.rows) {
         evidence.correspondences.push_back(pair.correspondences[row]);
         evidence.order.push_back(pair.order[row]);
+        evidence.noise.push_back(pair.noise[row]);
     }
     evidence.once = one_to_one(evidence.correspondences);
     return evidence;

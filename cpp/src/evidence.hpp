@@ -35,6 +35,7 @@ struct Evidence {
     Mask once;                         // those whose keypoints stand in no better one: refinement and choice count these
     Mask listed;                       // what a classical pipeline would fit to
     std::vector<double> order;         // ascending = promising without a network; NaN = unknown
+    std::vector<double> noise;         // of the positions, by the sizes of the keypoints; 1 = usual in the list
     double focal_px = 1.0;             // mean focal length
     bool calibrated = true;            // the intrinsics can be trusted
     std::optional<NetworkEvidence> network;  // nothing before it has run

@@ -319,6 +319,7 @@ PairInput prepare_pair(const MatchPair& pair) {
     const Attributes known = merge_attributes(pair, distances);
     input.attributes = encode_attributes(known, count);
     input.order = order_of(known, distances, count);
+    input.noise = relative_noise(known, input.valid);
     return input;
 }
 

@@ -20,6 +20,7 @@ struct PairInput {
     Mask valid;                       // 1 where the coordinates are usable
     std::vector<EncodedAttributes> attributes;
     std::vector<double> order;  // ascending = promising: the ratio where it is known, else the distance; NaN = neither
+    std::vector<double> noise;  // of the position of each match, by the sizes of its keypoints; 1 = usual in this list
     Intrinsics intrinsics1, intrinsics2;
     double unit_px = 1.0;  // pixels to a unit of the caller's coordinates
     double largest_threshold = 0.0;  // one above this is in pixels of the image in which the keypoints were found

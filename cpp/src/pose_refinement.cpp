@@ -12,7 +12,7 @@ constexpr double kInitialDamping = 1e-4;
 // Steps so short that they need more damping than this no longer pay.
 constexpr double kMaxDamping = 1.0;
 constexpr double kSmallestCurvature = 1e-12;
-constexpr double kConvergedDecrease = 1e-4;
+constexpr double kConvergedDecrease = 1e-4, kFinelyConvergedDecrease = 1e-5;
 // Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 constexpr double kReach = 12.0;
 
@@ -64,18 +64,46 @@ Pose apply_step(const Pose& pose, const Vec5d& step) {
             cv::normalize(pose.t + step[3] * basis[0] + step[4] * basis[1])};
 }
 
-/// Gauss-Newton matrix and gradient of the squared Sampson distances of the matches within the threshold.
+/// What a match adds to the cost, and how much it counts in the squares that stand for the cost near by.
+struct Loss {
+    double cost, weight;
+};
+
+/// The loss of a match of a squared Sampson distance, cut off at the threshold.
+auto truncated_at(double threshold) {
+    return [limit = threshold * threshold](std::size_t, double squared) {
+        return squared < limit ? Loss{squared, 1.0} : Loss{limit, 0.0};
+    };
+}
+
+/// Every match counts its squared distance.
+constexpr auto kSquares = [](std::size_t, double squared) { return Loss{squared, 1.0}; };
+
+/// Sum of the losses of all matches; `loss` takes the position of a match and its squared Sampson distance.
+template <typename LossOf>
+double cost_of(const Correspondences& matches, const Pose& pose, const LossOf& loss) {
+    double cost = 0.0;
+    for (std::size_t i = 0; i < matches.size(); ++i) {
+        cost += loss(i, SampsonTerm(matches[i], pose).squared_distance()).cost;
+    }
+    return cost;
+}
+
+/// Gauss-Newton matrix and gradient of the squared Sampson distances, weighted.
 struct NormalEquations {
     Matx55d hessian;
     Vec5d gradient;
-    int count = 0;  // of those matches
+    int count = 0;  // of the matches that count
 
-    NormalEquations(const Correspondences& matches, const Pose& pose, double threshold) {
+    template <typename LossOf>
+    NormalEquations(const Correspondences& matches, const Pose& pose, const LossOf& loss) {
         const auto basis = tangent_basis(pose.t);
         std::array<double, 15> upper{};
-        for (const Correspondence& match : matches) {
+        for (std::size_t index = 0; index < matches.size(); ++index) {
+            const Correspondence& match = matches[index];
             const SampsonTerm term(match, pose);
-            if (!(term.squared_distance() < threshold * threshold)) {
+            const double weight = loss(index, term.squared_distance()).weight;
+            if (!(weight > 0.0)) {
                 continue;
             }
             // The line normals are held fixed: their derivative changes the step little and doubles the work.
@@ -89,9 +117,9 @@ struct NormalEquations {
             std::size_t k = 0;
             for (std::size_t i = 0; i < 5; ++i) {
                 for (std::size_t j = i; j < 5; ++j) {
-                    upper[k++] += row[i] * row[j];
+                    upper[k++] += weight * row[i] * row[j];
                 }
-                gradient[static_cast<int>(i)] += term.error * scale * row[i];
+                gradient[static_cast<int>(i)] += weight * term.error * scale * row[i];
             }
             ++count;
         }
@@ -112,6 +140,54 @@ struct NormalEquations {
         return damped.solve(-gradient, cv::DECOMP_LU);
     }
 };
+
+/// The pose of the least cost that so many steps find, or fewer: one that gains less than a share `converged` is the last.
+template <typename LossOf>
+Pose minimise(const Correspondences& matches, Pose pose, const LossOf& loss, int rounds, double converged) {
+    double cost = cost_of(matches, pose, loss);
+    double damping = kInitialDamping;
+    for (int round = 0; round < rounds; ++round) {
+        const NormalEquations equations(matches, pose, loss);
+        if (equations.count < kMinRefinedInliers) {
+            break;
+        }
+        const double previous = cost;
+        for (; damping < kMaxDamping; damping *= 10.0) {
+            const Pose candidate = apply_step(pose, equations.step(damping));
+            const double candidate_cost = cost_of(matches, candidate, loss);
+            if (candidate_cost < cost) {
+                pose = candidate;
+                cost = candidate_cost;
+                damping *= 0.1;
+                break;
+            }
+        }
+        if (cost > (1.0 - converged) * previous) {
+            break;
+        }
+    }
+    return pose;
+}
+
+/// Positions of the matches that are nearer to a pose than this.
+std::vector<std::size_t> within(const Correspondences& matches, const Pose& pose, double reach) {
+    std::vector<std::size_t> reached;
+    for (std::size_t i = 0; i < matches.size(); ++i) {
+        if (SampsonTerm(matches[i], pose).squared_distance() < reach * reach) {
+            reached.push_back(i);
+        }
+    }
+    return reached;
+}
+
+Correspondences take(const Correspondences& matches, const std::vector<std::size_t>& positions) {
+    Correspondences taken;
+    taken.reserve(positions.size());
+    for (const std::size_t position : positions) {
+        taken.push_back(matches[position]);
+    }
+    return taken;
+}
 
 /// Summed squared Sampson distances of matches to a pose with another direction of translation, the rotation moved from
 /// the pose's as that likes best, to first order.
@@ -174,11 +250,7 @@ double direction_spread_deg(const Correspondences& inliers, const Pose& pose, do
 }  // namespace
 
 double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold) {
-    double cost = 0.0;
-    for (const Correspondence& match : matches) {
-        cost += std::min(SampsonTerm(match, pose).squared_distance(), threshold * threshold);
-    }
-    return cost;
+    return cost_of(matches, pose, truncated_at(threshold));
 }
 
 cv::Matx33d rotation_from_vector(const cv::Vec3d& vector) {
@@ -191,48 +263,36 @@ cv::Matx33d rotation_from_vector(const cv::Vec3d& vector) {
 }
 
 Pose refine_pose(const Correspondences& matches, const Pose& start, double threshold, int rounds) {
-    Correspondences reached;
-    reached.reserve(matches.size());
-    const double reach = kReach * threshold;
-    for (const Correspondence& match : matches) {
-        if (SampsonTerm(match, start).squared_distance() < reach * reach) {
-            reached.push_back(match);
-        }
-    }
+    const Correspondences reached = take(matches, within(matches, start, kReach * threshold));
     if (static_cast<int>(reached.size()) < kMinRefinedInliers) {
         return start;
     }
-    Pose pose = start;
-    double cost = truncated_cost(reached, pose, threshold);
-    double damping = kInitialDamping;
-    for (int round = 0; round < rounds; ++round) {
-        const NormalEquations equations(reached, pose, threshold);
-        if (equations.count < kMinRefinedInliers) {
-            break;
-        }
-        const double previous = cost;
-        for (; damping < kMaxDamping; damping *= 10.0) {
-            const Pose candidate = apply_step(pose, equations.step(damping));
-            const double candidate_cost = truncated_cost(reached, candidate, threshold);
-            if (candidate_cost < cost) {
-                pose = candidate;
-                cost = candidate_cost;
-                damping *= 0.1;
-                break;
-            }
-        }
-        if (cost > (1.0 - kConvergedDecrease) * previous) {
-            break;
-        }
+    return minimise(reached, start, truncated_at(threshold), rounds, kConvergedDecrease);
+}
+
+Pose refine_pose_by_weights(const Correspondences& matches, const Pose& start, const std::vector<double>& scale,
+                            const std::vector<double>& weights, double reach, int rounds) {
+    const std::vector<std::size_t> reached = within(matches, start, reach);
+    if (static_cast<int>(reached.size()) < kMinRefinedInliers) {
+        return start;
     }
-    return pose;
+    std::vector<double> of_squares;
+    for (const std::size_t row : reached) {
+        of_squares.push_back(weights[row] / (scale[row] * scale[row]));
+    }
+    const double largest = *std::max_element(of_squares.begin(), of_squares.end());
+    const auto cauchy = [&](std::size_t i, double squared) {
+        const double relative = squared / (scale[reached[i]] * scale[reached[i]]);
+        return Loss{weights[reached[i]] * std::log1p(relative), of_squares[i] / (largest * (1.0 + relative))};
+    };
+    return minimise(take(matches, reached), start, cauchy, rounds, kFinelyConvergedDecrease);
 }
 
 double direction_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise) {
     if (static_cast<int>(inliers.size()) < kMinRefinedInliers) {
         return 90.0;
     }
-    const NormalEquations equations(inliers, pose, std::numeric_limits<double>::infinity());
+    const NormalEquations equations(inliers, pose, kSquares);
     const cv::Matx33d rotation = equations.hessian.get_minor<3, 3>(0, 0) + kSmallestCurvature * cv::Matx33d::eye();
     const cv::Matx<double, 3, 2> cross = equations.hessian.get_minor<3, 2>(0, 3);
     const cv::Matx22d marginal =
@@ -247,7 +307,7 @@ double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, do
     if (static_cast<int>(inliers.size()) < kMinRefinedInliers) {
         return 90.0;
     }
-    const NormalEquations equations(inliers, pose, std::numeric_limits<double>::infinity());
+    const NormalEquations equations(inliers, pose, kSquares);
     cv::Mat eigenvalues;  // in descending order
     cv::eigen(cv::Mat(equations.hessian), eigenvalues);
     const double curvature = eigenvalues.at<double>(4);

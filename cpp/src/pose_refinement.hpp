@@ -1,4 +1,4 @@
-// Least squares on the pose: Levenberg-Marquardt on the truncated Sampson error of all matches;
+// Least squares on the pose: Levenberg-Marquardt on a robust cost of the Sampson errors of all matches;
 // mgca_filter/geometry/pose_refinement.py.
 //
 // The pose has five degrees of freedom: a rotation vector applied on the left of R, and two steps of the unit
@@ -8,6 +8,8 @@
 
 #include "epipolar.hpp"
 
+#include <vector>
+
 namespace mgca::detail {
 
 constexpr int kMinRefinedInliers = 6;
@@ -15,6 +17,14 @@ constexpr int kMinRefinedInliers = 6;
 /// Refine a pose on the matches within the threshold (Sampson distance, normalised), which are chosen anew in every
 /// round; the truncated cost never rises.
 Pose refine_pose(const Correspondences& matches, const Pose& start, double threshold, int rounds = 10);
+
+/// Refine a pose by a Cauchy loss: a match counts the less, the farther off it is in terms of its noise; the cost never
+/// rises.
+///
+/// @param scale Sampson distance at which a match counts half, normalised. weights: what it counts beside, above 0.
+/// @param reach Sampson distance beyond which matches are left out, normalised.
+Pose refine_pose_by_weights(const Correspondences& matches, const Pose& start, const std::vector<double>& scale,
+                            const std::vector<double>& weights, double reach, int rounds = 15);
 
 /// Sum of squared Sampson distances, each cut off at the threshold: what MSAC minimises.
 double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold);

@@ -18,6 +18,9 @@
 namespace mgca::detail {
 
 constexpr double kRefinePx = 1.0;
+// The last refinement: a match counts half at three times the median distance of the inliers, between these limits; none
+// counts beyond the reach.
+constexpr double kHalfWeightMedians = 3.0, kLeastHalfWeightPx = 1e-3, kHalfWeightPx = 0.5, kLastReachPx = 6.0;
 
 /// Model of a pair of images, on the normalised image planes.
 struct TwoViewModel {
@@ -61,12 +64,14 @@ private:
     bool settled();
     const Judgement& judge();
     std::optional<TwoViewModel> chosen(const char* ended);
+    TwoViewModel refined(TwoViewModel model) const;
     std::optional<TwoViewModel> fundamental();
 
     const Coefficients& coefficients_;
     const Options& options_;
     Evidence evidence_;
     Correspondences judged_, fitted_;
+    std::vector<double> noise_;  // of those that are judged
     std::vector<Found> poses_;
     std::optional<Pose> twins_of_;
     std::optional<Judgement> judgement_;

@@ -123,6 +123,46 @@ void refinement_finds_the_pose_and_never_raises_the_cost() {
     check::near(pose_uncertainty_deg({}, kPose, 1e-3), 90.0, 0.0, "nothing holds a pose of no matches");
 }
 
+void firm_matches_hold_the_pose() {
+    double by_noise = 0.0, alike = 0.0;
+    for (unsigned seed = 0; seed < 8; ++seed) {
+        Correspondences matches = draw_matches(kPose, 60, 0.1, seed);
+        const Correspondences coarse = draw_matches(kPose, 120, 0.8, seed + 20);
+        matches.insert(matches.end(), coarse.begin(), coarse.end());
+        std::vector<double> scale(180, 0.5 / kFocal), weights(180, 1.0);
+        const double reach = 6.0 / kFocal;
+        alike += pose_angle_deg(refine_pose_by_weights(matches, kPose, scale, weights, reach), kPose);
+        std::fill(scale.begin(), scale.begin() + 60, 0.1 / kFocal);
+        std::fill(scale.begin() + 60, scale.end(), 0.8 / kFocal);
+        by_noise += pose_angle_deg(refine_pose_by_weights(matches, kPose, scale, weights, reach), kPose);
+        std::fill(weights.begin() + 60, weights.end(), 1e-9);
+        const Pose firm = refine_pose_by_weights(matches, kPose, scale, weights, reach);
+        const std::vector<double> of_firm(scale.begin(), scale.begin() + 60), ones(60, 1.0);
+        const Correspondences firm_matches(matches.begin(), matches.begin() + 60);
+        const Pose alone = refine_pose_by_weights(firm_matches, kPose, of_firm, ones, reach);
+        check::near(pose_angle_deg(firm, alone), 0.0, 1e-3, "what weighs nothing is not felt");
+    }
+    check::that(by_noise < 0.7 * alike, "matches count by their noise");
+    const Correspondences few = draw_matches(kPose, 5, 0.3, 0);
+    const std::vector<double> ones(5, 1.0);
+    check::near(cv::norm(refine_pose_by_weights(few, kPose, ones, ones, 1.0).R - kPose.R), 0.0, 0.0,
+                "five matches refine nothing");
+}
+
+void noise_follows_the_size_of_keypoints() {
+    const float unknown = std::numeric_limits<float>::quiet_NaN();
+    mgca::Attributes known;
+    known.size1 = {2, 2, 2, 4, 100, unknown, 0, 900};
+    known.size2 = {2, 2, 2, 4, 100, 2, 2, 900};
+    const std::vector<double> noise = relative_noise(known, {1, 1, 1, 1, 1, 1, 1, 0});
+    const std::vector<double> expected{1, 1, 1, std::pow(2.0, 0.75), 3, 1, 1, 3};
+    for (std::size_t i = 0; i < noise.size(); ++i) {
+        check::near(noise[i], expected[i], 1e-12, "noise by size, between its limits");
+    }
+    known.size2.clear();
+    check::that(relative_noise(known, Mask(8, 1)) == std::vector<double>(8, 1.0), "unknown sizes");
+}
+
 void repetitions_count_once() {
     const Correspondences matches{{3, 0, 0, 0}, {1, 2, 3, 4}, {3, 0, 0, 0}, {1, 2, 9, 9}, {5, 5, 3, 4}, {7, 7, 8, 8}};
     check::that(distinct_rows(matches) == Rows{0, 1, 3, 4, 5}, "distinct rows, the first of equals");
@@ -344,20 +384,21 @@ void the_likelier_hypothesis_is_chosen() {
     matches.insert(matches.end(), wrong.begin(), wrong.end());
     std::vector<double> scores(160, 0.1);
     std::fill(scores.begin(), scores.begin() + 80, 0.9);
+    const std::vector<double> alike(160, 1.0);
     const Pose other{rotation_from_vector({0.3, 0.0, 0.1}), {0.0, 0.0, 1.0}};
     const std::vector<Hypothesis> hypotheses{{other, Family::network}, {kPose, Family::accepted}};
     Coefficients c = coefficients();
-    const Judgement judged = judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c);
+    const Judgement judged = judge_hypotheses(matches, alike, scores, hypotheses, kFocal, {}, c);
     check::equal(judged.chosen, std::size_t{1}, "the true pose");
     check::that(judged[Feature::likelihood_to_alternative] > 3.0, "far from its alternative");
     check::near(judged[Feature::no_network], 1.0, 0.0, "no network E");
-    check::equal(judge_hypotheses(matches, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
+    check::equal(judge_hypotheses(matches, alike, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
                  "without scores as well");
     // Confidence is the logistic function of the weighted features.
     check::near(confidence(judged, c), 1.0 / (1.0 + std::exp(-judged[Feature::log_count])), 1e-12, "confidence");
     check::near(early_confidence(judged, c), 1.0 / (1.0 + std::exp(-1.0)), 1e-12, "early confidence");
     c.support_weight = {-1e3};  // relative support against itself: the worst supported one wins
-    check::equal(judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
+    check::equal(judge_hypotheses(matches, alike, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
                  "support_weight is felt");
     check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse("{}")); }, "score_trust is missing");
     check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse(R"({"score_trust": [1]})")); },
@@ -369,7 +410,9 @@ void residuals_become_scores() {
     Correspondences all = matches;
     const Correspondences wrong = draw_wrong(60, 12);
     all.insert(all.end(), wrong.begin(), wrong.end());
-    const Residuals residuals = measure_residuals(all, kPose, kFocal);
+    const Residuals residuals = measure_residuals(all, std::vector<double>(120, 1.0), kPose, kFocal);
+    const Residuals coarse = measure_residuals(all, std::vector<double>(120, 2.0), kPose, kFocal);
+    check::near(coarse.distance_px[7], 0.5 * residuals.distance_px[7], 1e-12, "in units of the noise of a match");
     const std::vector<double> scores = posterior(residuals, {Mask(120, 1)}, 1.0, coefficients());
     const double right = std::accumulate(scores.begin(), scores.begin() + 60, 0.0) / 60.0;
     const double mistaken = std::accumulate(scores.begin() + 60, scores.end(), 0.0) / 60.0;
@@ -417,6 +460,8 @@ int main() {
     json_is_read();
     exact_matches_have_no_residual();
     refinement_finds_the_pose_and_never_raises_the_cost();
+    firm_matches_hold_the_pose();
+    noise_follows_the_size_of_keypoints();
     repetitions_count_once();
     raw_lists_are_told_from_filtered_ones();
     evidence_is_taken_from_above_a_margin();

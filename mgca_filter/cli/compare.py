@@ -82,6 +82,7 @@ def fit_baselines(
             one_to_one(correspondences[rows]),
             np.ones(len(rows), dtype=bool),
             np.full(len(rows), np.nan),
+            np.ones(len(rows)),
             focal_px,
             calibrated=not camera1.guessed,
         )

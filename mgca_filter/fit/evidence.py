@@ -34,6 +34,7 @@ class Evidence:
         listed: (N,) bool, what a classical pipeline would fit to: all of a filtered list, of a raw one the best of
             the list with a ratio below 0.9.
         order: (N,) ascending = promising without a network: ratio or descriptor distance; NaN = unknown.
+        noise: (N,) of the positions, by the sizes of the keypoints; 1 = usual in the list.
         focal_px: mean focal length, pixels.
         calibrated: the intrinsics can be trusted.
         scores: (N,) probabilities of the network; None before it has run.
@@ -46,6 +47,7 @@ class Evidence:
     once: NDArray[np.bool_]
     listed: NDArray[np.bool_]
     order: Array
+    noise: Array
     focal_px: float
     calibrated: bool = True
     scores: Array | None = None
@@ -90,6 +92,7 @@ def gather_before(pair: PairInput) -> Evidence:
         one_to_one(correspondences),
         np.ones(len(rows), dtype=bool),
         pair.order[rows],
+        pair.noise[rows],
         pair.focal_px,
         pair.calibrated,
     )
@@ -120,6 +123,7 @@ def gather_scored(
         one_to_one(correspondences),
         listed_rows(pair.attributes, pair.valid)[rows],
         pair.order[rows],
+        pair.noise[rows],
         pair.focal_px,
         pair.calibrated,
         scores[rows].astype(np.float64),

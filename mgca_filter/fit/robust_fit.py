@@ -19,7 +19,7 @@ from ..geometry.epipolar import (
     project_to_essential,
     sampson_distance,
 )
-from ..geometry.pose_refinement import refine_pose
+from ..geometry.pose_refinement import refine_pose, refine_pose_by_weights
 from ..inputs.options import FilterOptions
 from ..inputs.pair import PairInput
 from . import choice, sources
@@ -31,6 +31,9 @@ from .sources import Family, Proposal
 Array = NDArray[np.float64]
 
 REFINE_PX = 1.0
+# The last refinement: a match counts half at three times the median distance of the inliers, between these limits; none
+# counts beyond the reach.
+HALF_WEIGHT_MEDIANS, LEAST_HALF_WEIGHT_PX, HALF_WEIGHT_PX, LAST_REACH_PX = 3.0, 1e-3, 0.5, 6.0
 # A hypothesis this close to a refined one would end there; one this close to the best is no twin of it.
 SAME_DEG, TWIN_DEG = 0.3, 2.0
 # The early end is given up where a run explains less than the first share of the list; above the second, one will do.
@@ -75,6 +78,7 @@ class Plan:
         second: those that are tried where the first do not settle it.
         twins: propose the twin that the dominant plane allows as well.
         settle: leave the second out where the first agree.
+        last_refinement: refine what was chosen once more, on all matches by what each is worth.
     """
 
     before: tuple[Proposal, ...] = BEFORE_NETWORK
@@ -82,6 +86,7 @@ class Plan:
     second: tuple[Proposal, ...] = SECOND
     twins: bool = True
     settle: bool = True
+    last_refinement: bool = True
 
 
 PLAN = Plan()
@@ -160,7 +165,7 @@ class Search:
         if model is None or judgement is None or not choice.explains_list(judgement, self._coefficients):
             return None
         same = self._twins_of is not None and _angle_deg(self._twins_of, self._best()) < TWIN_DEG
-        return replace(model, plane=self._plane) if same else model
+        return self._refined(replace(model, plane=self._plane) if same else model)
 
     def with_network(self, evidence: Evidence) -> TwoViewModel | None:
         """The model by all sources, on scored matches; None where nothing is found."""
@@ -173,7 +178,7 @@ class Search:
         if alone is not None:
             self._poses = []
             self._propose((alone,))
-            return self.current("all sources")
+            return self._refined(self.current("all sources"))
         self._propose(self._plan.first)
         ended = "first sources"
         poselib = self._options.method == "poselib"
@@ -186,11 +191,11 @@ class Search:
             self._propose((POSELIB,) if poselib else ())
         if self._poses:
             self._propose_twins()
-        return self.current(ended)
+        return self._refined(self.current(ended))
 
     def _take(self, evidence: Evidence) -> None:
         self._evidence, self._judgement = evidence, None
-        self._judged = evidence.correspondences[evidence.once]
+        self._judged, self._noise = evidence.correspondences[evidence.once], evidence.noise[evidence.once]
         fitted = evidence.listed
         if evidence.scores is not None:
             fitted = fitted | (evidence.scores > ACCEPTED_SCORE)
@@ -224,7 +229,7 @@ class Search:
         self._plane = sources.dominant_plane(self._evidence, best.R, best.t, self._options.seed)
         found = [pose_from_essential(E, self._fitted, self._evidence.focal_px) for E in sources.plane(self._plane)]
         twins = [_Pose(*pose, Family.PLANE, "plane") for pose in found if pose is not None]
-        near = self._near([best, *twins], self._fitted, TWIN_PX)
+        near = self._near([best, *twins], self._fitted, TWIN_PX, 1.0)
         for twin, count in zip(twins, near[1:]):
             if count > TWIN_SHARE * near[0] and all(_angle_deg(twin, other) > TWIN_DEG for other in self._poses):
                 self._add(twin)
@@ -240,10 +245,10 @@ class Search:
         self._poses.append(_Pose(R, t, found.family, found.origin))
         self._judgement = None
 
-    def _near(self, poses: Sequence[_Pose], matches: Array, reach_px: float) -> list[int]:
-        """Numbers of matches (N, 4) within a distance of each pose and in front of it."""
+    def _near(self, poses: Sequence[_Pose], matches: Array, reach_px: float, noise: Array | float) -> list[int]:
+        """Numbers of matches (N, 4) of a noise (N,) within a distance of each pose and in front of it."""
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px)
+        residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px, noise)
         near = (residuals.distance_px < reach_px) & ~residuals.behind
         return [int(count) for count in near.sum(axis=1)]
 
@@ -255,7 +260,7 @@ class Search:
         """Share of the matches that the best of what was found explains."""
         if not self._poses:
             return 0.0
-        inliers = self._near([self._best()], self._judged, choice.INLIER_PX)[0]
+        inliers = self._near([self._best()], self._judged, choice.INLIER_PX, self._noise)[0]
         return choice.explained_share(inliers, len(self._judged))
 
     def _settled(self) -> bool:
@@ -288,6 +293,7 @@ class Search:
                 evidence.focal_px,
                 _poses_of_network(evidence),
                 self._coefficients,
+                self._noise,
             )
         return self._judgement
 
@@ -301,6 +307,30 @@ class Search:
         E = essential_from_pose(pose.R, pose.t)
         confidence = rate(judgement, self._coefficients)
         return TwoViewModel(E, E, pose.R, pose.t, pose.origin, ended, confidence, judgement)
+
+    def _refined(self, model: TwoViewModel | None) -> TwoViewModel | None:
+        """The model after the last refinement: a match counts by its noise and by the probability that it is right.
+
+        That is its score, more where most of the list agrees with the pose: then the list knows better.
+        """
+        if model is None or model.judgement is None or not self._plan.last_refinement:
+            return model
+        evidence = self._evidence
+        weights = np.ones(len(self._judged))
+        if evidence.scores is not None:
+            share = np.exp(model.judgement.features["log share"])
+            agreement = share**3 / (share**3 + (1.0 - share) ** 3)
+            weights = 1.0 - (1.0 - evidence.scores[evidence.once]) * (1.0 - agreement)
+        distance = model.judgement.distance_px
+        inliers = distance[distance < choice.INLIER_PX]
+        median = float(np.median(inliers)) if len(inliers) else HALF_WEIGHT_PX
+        half_px = min(max(HALF_WEIGHT_MEDIANS * median, LEAST_HALF_WEIGHT_PX), HALF_WEIGHT_PX)
+        pixel = 1.0 / evidence.focal_px
+        R, t = refine_pose_by_weights(
+            self._judged, model.R, model.t, half_px * pixel * self._noise, weights, LAST_REACH_PX * pixel
+        )
+        E = essential_from_pose(R, t)
+        return replace(model, M=E, E=E, R=R, t=t)
 
     def _fundamental(self) -> TwoViewModel | None:
         """The fundamental matrix of a pair without intrinsics, and the pose that the guessed ones make of it.
@@ -330,7 +360,9 @@ def scores_by_residuals(pair: PairInput, model: TwoViewModel, coefficients: Coef
     """Scores (M,) of a pair that ended before the network, from the residuals of its matches to the model."""
     valid, listed = pair.valid, listed_rows(pair.attributes, pair.valid)
     scores = np.zeros(len(valid), dtype=np.float32)
-    residuals = choice.measure_residuals(pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px)
+    residuals = choice.measure_residuals(
+        pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px, pair.noise[valid]
+    )
     scale = 1.0 if model.judgement is None else model.judgement.scale
     groups = (listed[valid], ~listed[valid])
     scores[valid] = choice.posterior(residuals, groups, scale, coefficients)

@@ -1,4 +1,4 @@
-"""Least squares on the pose: Levenberg–Marquardt on the truncated Sampson error of all matches.
+"""Least squares on the pose: Levenberg–Marquardt on a robust cost of the Sampson errors of all matches.
 
 The pose has five degrees of freedom: a rotation vector applied on the left of R and two steps of the unit
 translation on its tangent plane (PoseLib and Hartley & Zisserman, 2nd ed., sec. 11.4.3, do the same).
@@ -6,6 +6,7 @@ translation on its tangent plane (PoseLib and Hartley & Zisserman, 2nd ed., sec.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import hypot, sqrt
 
 import cv2
@@ -15,12 +16,14 @@ from numpy.typing import NDArray
 from .epipolar import cross_matrix, homogeneous_columns
 
 Array = NDArray[np.float64]
+# Cost of residuals (N,), and by how much each counts in the squares that stand for it near by, (N,).
+Loss = Callable[[Array], tuple[float, Array]]
 
 _INITIAL_DAMPING = 1e-4
 # Steps so short that they need more damping than this no longer pay.
 _MAX_DAMPING = 1.0
 _SMALLEST_CURVATURE = 1e-12
-_CONVERGED_DECREASE = 1e-4
+_CONVERGED_DECREASE, _FINELY_CONVERGED_DECREASE = 1e-4, 1e-5
 MIN_INLIERS = 6
 # Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
 _LINEAR_DEG, _RINGS, _SPOKES, _SPREAD_ROWS = 0.1, 28, 12, 200
@@ -44,32 +47,68 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
         The refined R, t; its truncated cost is never above the one it started from.
     """
     x1, x2 = _columns(correspondences)
-    now = SampsonTerms(x1, x2, R, t)
-    reached = np.abs(now.residual) < REACH * threshold
+    residual = SampsonTerms(x1, x2, R, t).residual
+    reached = np.abs(residual) < REACH * threshold
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
     if not reached.all():
         x1, x2 = x1[:, reached], x2[:, reached]
-        now = SampsonTerms(x1, x2, R, t)
-    cost, near = _truncated(now.residual, threshold)
+    return _minimise(SampsonTerms(x1, x2, R, t), lambda r: _truncated(r, threshold), rounds, _CONVERGED_DECREASE)
+
+
+def refine_pose_by_weights(
+    correspondences: Array, R: Array, t: Array, scale: Array, weights: Array, reach: float, rounds: int = 15
+) -> tuple[Array, Array]:
+    """Refine a relative pose by a Cauchy loss: a match counts the less, the farther off it is in terms of its noise.
+
+    Args:
+        correspondences: (N, 4) on the normalised image planes, finite.
+        R, t: (3, 3) and (3,) unit norm, ``X2 = R X1 + t``.
+        scale: (N,) Sampson distance at which a match counts half, normalised.
+        weights: (N,) what a match counts beside its noise, above 0.
+        reach: Sampson distance beyond which matches are left out, normalised.
+        rounds: largest number of steps.
+
+    Returns:
+        The refined R, t; its cost is never above the one it started from.
+    """
+    x1, x2 = _columns(correspondences)
+    reached = np.abs(SampsonTerms(x1, x2, R, t).residual) < reach
+    if np.count_nonzero(reached) < MIN_INLIERS:
+        return R, t
+    of_squares = weights[reached] / scale[reached] ** 2
+    of_squares = of_squares / of_squares.max()
+
+    def cauchy(residual: Array) -> tuple[float, Array]:
+        relative = (residual / scale[reached]) ** 2
+        return float((weights[reached] * np.log1p(relative)).sum()), of_squares / (1.0 + relative)
+
+    return _minimise(SampsonTerms(x1[:, reached], x2[:, reached], R, t), cauchy, rounds, _FINELY_CONVERGED_DECREASE)
+
+
+def _minimise(start: SampsonTerms, loss: Loss, rounds: int, converged: float) -> tuple[Array, Array]:
+    """R, t of the least cost after so many steps; one that gains less than a share ``converged`` is the last."""
+    now = start
+    cost, weights = loss(now.residual)
     damping = _INITIAL_DAMPING
     for _ in range(rounds):
-        if np.count_nonzero(near) < MIN_INLIERS:
+        if np.count_nonzero(weights) < MIN_INLIERS:
             break
-        J = now.derivatives() * near
-        hessian, gradient = J @ J.T, J @ now.residual
+        derivatives = now.derivatives()
+        J = derivatives * weights
+        hessian, gradient = J @ derivatives.T, J @ now.residual
         diagonal = np.diag(np.diag(hessian) + _SMALLEST_CURVATURE)
         previous = cost
         while damping < _MAX_DAMPING:
             step = -np.asarray(np.linalg.solve(hessian + damping * diagonal, gradient), dtype=np.float64)
-            new = SampsonTerms(x1, x2, *apply_step(now.R, now.t, step))
-            new_cost, new_near = _truncated(new.residual, threshold)
+            new = now.moved(step)
+            new_cost, new_weights = loss(new.residual)
             if new_cost < cost:
-                now, cost, near = new, new_cost, new_near
+                now, cost, weights = new, new_cost, new_weights
                 damping *= 0.1
                 break
             damping *= 10.0
-        if cost > (1.0 - _CONVERGED_DECREASE) * previous:
+        if cost > (1.0 - converged) * previous:
             break
     return now.R, now.t
 
@@ -184,6 +223,10 @@ class SampsonTerms:
         self._scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
         self.residual = np.einsum("in,in->n", line2, x2) * self._scale
 
+    def moved(self, step: Array) -> SampsonTerms:
+        """Those of the pose after a step (5,)."""
+        return SampsonTerms(self._x1, self._x2, *apply_step(self.R, self.t, step))
+
     def derivatives(self) -> Array:
         """Derivatives (5, N) of the residuals by a rotation on the left of R and two steps of t, normals held fixed."""
         T = cross_matrix(self.t)
@@ -202,10 +245,10 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-def _truncated(residual: Array, threshold: float) -> tuple[float, NDArray[np.bool_]]:
-    """Sum of the squares, cut off at the threshold, and what lies within it (N,)."""
+def _truncated(residual: Array, threshold: float) -> tuple[float, Array]:
+    """Sum of the squares, cut off at the threshold; what lies within it (N,) counts 1, the rest 0."""
     squared = residual * residual
-    return float(np.minimum(squared, threshold**2).sum()), squared < threshold**2
+    return float(np.minimum(squared, threshold**2).sum()), (squared < threshold**2).astype(np.float64)
 
 
 def _tangent_basis(t: Array) -> Array:

@@ -23,6 +23,9 @@ class Column(IntEnum):
 
 
 ATTRIBUTE_COUNT = len(Column)
+# A keypoint's noise grows with this power of its size; what is known of that is believed within these limits.
+_NOISE_POWER = 0.75
+_LEAST_NOISE, _LARGEST_NOISE = 0.4, 3.0
 CANDIDATE_MAX_RATIO = 0.95
 CANDIDATE_MIN_COUNT = 32
 
@@ -72,6 +75,25 @@ class MatchAttributes:
             encoded[:, Column.SIN_TURN] = np.where(known, np.sin(turn), 0.0)
             encoded[:, Column.SHAPE_KNOWN] = known
         return encoded
+
+    def relative_noise(self, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """How noisy the position of each match (M,) is, the usual match of the list being 1; 1 where it is not known.
+
+        A detector locates small keypoints better than large ones. The squares of the sizes in both images add up.
+
+        Args:
+            valid: (M,) the matches that tell what is usual.
+        """
+        noise = np.ones(len(valid))
+        if self.size1 is None or self.size2 is None:
+            return noise
+        size = np.sqrt(0.5 * (self.size1.astype(np.float64) ** 2 + self.size2.astype(np.float64) ** 2))
+        with np.errstate(invalid="ignore"):
+            known = np.isfinite(size) & (self.size1 > 0) & (self.size2 > 0)
+        usual = size[known & valid]
+        if len(usual):
+            noise[known] = np.clip((size[known] / np.median(usual)) ** _NOISE_POWER, _LEAST_NOISE, _LARGEST_NOISE)
+        return noise
 
     def take(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> MatchAttributes:
         """The same attributes for a selection of matches."""

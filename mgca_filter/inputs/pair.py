@@ -69,6 +69,7 @@ class PairInput:
         attributes: (M, 8) float32, encoded.
         order: (M,) float64, ascending = promising: the ratio where it is known, else the descriptor distance; NaN where
             neither is.
+        noise: (M,) float64, of the position of each match, by the sizes of its keypoints; 1 = usual in this list.
         intrinsics1, intrinsics2: cameras, given or guessed, in pixels.
         unit_px: pixels to a unit of the caller's coordinates, pixels being those of the image in which the keypoints
             were found: 1; of a smaller copy 1 / ``resolution``; where the coordinates are normalised or millimetres,
@@ -86,6 +87,7 @@ class PairInput:
     valid: NDArray[np.bool_]
     attributes: NDArray[np.float32]
     order: NDArray[np.float64]
+    noise: NDArray[np.float64]
     intrinsics1: Intrinsics
     intrinsics2: Intrinsics
     unit_px: float = 1.0
@@ -218,6 +220,7 @@ def prepare_pair(pair: MatchPair) -> PairInput:
         valid,
         known.encode(len(putative)),
         _order(known, putative),
+        known.relative_noise(valid),
         intrinsics1,
         intrinsics2,
         unit_px,

@@ -426,6 +426,40 @@ def test_one_estimator_alone_is_the_classical_pipeline(scene: Scene) -> None:
     assert sorted(ALONE) == ["magsac", "prosac", "ransac"]
 
 
+def with_coarse_keypoints(seed: int) -> Scene:
+    """A third of the right matches is fine, the rest coarse, as the sizes of their keypoints tell."""
+    fine = make_scene(right=50, wrong=20, noise_px=0.1, seed=seed)
+    coarse = make_scene(right=100, wrong=40, noise_px=0.8, seed=seed + 100)
+    scene = joined(fine, coarse)
+    size = np.repeat([1.0, 8.0], [70, 140]).astype(np.float32)
+    return replace(scene, attributes=replace(scene.attributes, size1=size, size2=size))
+
+
+@pytest.mark.parametrize("fit", [early, late])
+def test_the_last_refinement_knows_which_keypoints_are_fine(fit) -> None:
+    plain = replace(PLAN, last_refinement=False)
+    errors = np.array(
+        [
+            [error_deg(fit(scene), scene), error_deg(fit(scene, plan=plain), scene)]
+            for scene in map(with_coarse_keypoints, range(6))
+        ]
+    )
+    assert errors.mean(axis=0)[0] < 0.8 * errors.mean(axis=0)[1]
+
+
+def test_the_last_refinement_trusts_scores_unless_the_list_knows_better() -> None:
+    # A third of the matches is wrong and lies near the epipolar lines all the same.
+    scene = make_scene(right=100, wrong=0, noise_px=0.2)
+    shifted = make_scene(right=50, wrong=0, noise_px=0.2, seed=5)
+    shifted = replace(shifted, points2=shifted.points2 + [0.0, 1.5], inlier=np.zeros(50, dtype=bool))
+    mixed = joined(scene, shifted, make_scene(right=0, wrong=150, seed=6))
+    margins = np.where(mixed.inlier, 4.0, -6.0)
+    known, blind = late(mixed, margins=margins), late(mixed, margins=np.zeros(len(margins)))
+    assert known is not None
+    assert blind is not None
+    assert error_deg(known, mixed) < 0.7 * error_deg(blind, mixed)
+
+
 def test_pose_puts_points_in_front_however_far() -> None:
     far = make_scene(noise_px=0.0, wrong=0)
     rows = normalized(far)

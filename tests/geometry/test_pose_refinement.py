@@ -15,6 +15,7 @@ from mgca_filter.geometry.pose_refinement import (
     direction_uncertainty_deg,
     pose_uncertainty_deg,
     refine_pose,
+    refine_pose_by_weights,
     rotation_from_vector,
     truncated_cost,
 )
@@ -35,6 +36,41 @@ def test_refinement_stays_at_the_exact_pose() -> None:
     exact = make_scene(wrong=0, noise_px=0.0)
     refined = refine_pose(normalized(exact), exact.R, exact.t, 1.0 / FOCAL)
     assert pose_error_deg(*refined, exact.R, exact.t) < 1e-5
+
+
+def test_by_weights_the_exact_pose_stays_whatever_the_weights() -> None:
+    exact = make_scene(wrong=0, noise_px=0.0)
+    rng = np.random.default_rng(0)
+    scale, weights = rng.uniform(0.1, 2.0, (2, len(exact.inlier)))
+    refined = refine_pose_by_weights(normalized(exact), exact.R, exact.t, scale / FOCAL, weights, 6.0 / FOCAL)
+    assert pose_error_deg(*refined, exact.R, exact.t) < 1e-5
+
+
+def test_what_is_located_well_holds_the_pose() -> None:
+    by_noise, alike = [], []
+    for seed in range(10):
+        exact = make_scene(wrong=0, right=150, noise_px=0.0, seed=seed)
+        noise = np.where(np.arange(150) < 50, 0.1, 0.8)
+        drawn = np.random.default_rng(seed).normal(0, 1, (150, 4)) * noise[:, None] / FOCAL
+        rows = normalized(exact) + drawn
+        for errors, scale in ((by_noise, noise), (alike, np.full(150, 0.5))):
+            refined = refine_pose_by_weights(rows, exact.R, exact.t, scale / FOCAL, np.ones(150), 6.0 / FOCAL)
+            errors.append(pose_error_deg(*refined, exact.R, exact.t))
+    assert np.mean(by_noise) < 0.7 * np.mean(alike)
+
+
+def test_what_weighs_nothing_or_is_out_of_reach_is_not_felt() -> None:
+    right, mixed = make_scene(wrong=0, right=100), make_scene(wrong=0, right=60, noise_px=2.0, seed=1)
+    rows = np.vstack([normalized(right), normalized(mixed)])
+    scale, weights = np.full(160, 0.5 / FOCAL), np.where(np.arange(160) < 100, 1.0, 1e-9)
+    alone = refine_pose_by_weights(rows[:100], right.R, right.t, scale[:100], weights[:100], 6.0 / FOCAL)
+    together = refine_pose_by_weights(rows, right.R, right.t, scale, weights, 6.0 / FOCAL)
+    assert pose_error_deg(*together, *alone) < 1e-3
+    far = rows + np.where(np.arange(160) < 100, 0.0, 0.1)[:, None] * [0, 0, 1, -1]
+    out_of_reach = refine_pose_by_weights(far, right.R, right.t, scale, np.ones(160), 6.0 / FOCAL)
+    assert pose_error_deg(*out_of_reach, *alone) < 1e-3
+    few = refine_pose_by_weights(rows[:5], right.R, right.t, scale[:5], weights[:5], 6.0 / FOCAL)
+    np.testing.assert_array_equal(few[0], right.R)
 
 
 def terms(rows: np.ndarray, R: np.ndarray, t: np.ndarray) -> SampsonTerms:

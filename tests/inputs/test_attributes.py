@@ -34,6 +34,30 @@ def test_encoding_is_finite_whatever_comes_in(values: list[float]) -> None:
     assert np.isfinite(attributes.encode(len(values))).all()
 
 
+def noise_of(size1: list[float], size2: list[float], valid: list[int] | None = None) -> np.ndarray:
+    sizes = (np.array(size1, dtype=np.float32), np.array(size2, dtype=np.float32))
+    known = MatchAttributes(size1=sizes[0], size2=sizes[1])
+    return known.relative_noise(np.ones(len(size1), bool) if valid is None else np.array(valid, bool))
+
+
+def test_noise_follows_the_size_of_keypoints_whatever_its_unit() -> None:
+    sizes = [2.0, 2.0, 2.0, 4.0]
+    expected = [1, 1, 1, 2**0.75]
+    np.testing.assert_allclose(noise_of(sizes, sizes), expected)
+    np.testing.assert_allclose(noise_of([31 * s for s in sizes], [31 * s for s in sizes]), expected, rtol=1e-6)
+    np.testing.assert_allclose(noise_of([2, 2, 2, 2], [2, 2, 2, 4])[3], 2.5**0.375, rtol=1e-6)
+    # Matches without usable coordinates do not tell what is usual.
+    np.testing.assert_allclose(noise_of([2, 4, 4, 4], [2, 4, 4, 4], [1, 0, 0, 0]), [1, *[2**0.75] * 3])
+
+
+def test_noise_has_limits_and_is_usual_where_sizes_are_unknown() -> None:
+    np.testing.assert_allclose(noise_of([2, 2, 2, 900, 0.01], [2, 2, 2, 900, 0.01]), [1, 1, 1, 3, 0.4])
+    odd = [2.0, np.nan, 0.0, -1.0, np.inf]
+    np.testing.assert_array_equal(noise_of(odd, [2.0] * 5), 1.0)
+    np.testing.assert_array_equal(noise_of(odd, odd, [0] * 5), 1.0)
+    np.testing.assert_array_equal(MatchAttributes().relative_noise(np.ones(3, bool)), 1.0)
+
+
 def encoded(count: int, hopeless: int) -> np.ndarray:
     ratio = np.where(np.arange(count) < hopeless, 0.97, 0.6).astype(np.float32)
     return MatchAttributes(ratio=ratio, best=np.ones(count, dtype=bool)).encode(count)
