@@ -98,11 +98,11 @@ def compare(
     import pycolmap
 
     from mgca_filter.pipelines.colmap import DatabaseSource, open_database, two_view_geometry
-    from mgca_filter.pipelines.worker import PairWorker
+    from mgca_filter.pipelines.worker import MAPPING_THRESHOLD_PX, PairWorker
 
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
-    worker = PairWorker({"seed": seed, "model": model})
+    worker = PairWorker({"seed": seed, "model": model, "threshold": MAPPING_THRESHOLD_PX})
     ms = {"COLMAP": 0.0, "mgca_filter": 0.0}
     geometries: dict[str, dict[tuple[int, int], Any]] = {name: {} for name in ms}
     with closing(open_database(database)) as opened:

@@ -52,16 +52,24 @@ def add_detector_options(parser: Any) -> None:
     )
 
 
-def add_filter_options(parser: argparse.ArgumentParser, *, fit_required: bool = False) -> None:
-    """The options that :func:`filter_options` reads; with ``fit_required`` scores alone are no method."""
+def add_filter_options(
+    parser: argparse.ArgumentParser, *, fit_required: bool = False, threshold: float = FilterOptions.threshold
+) -> None:
+    """The options that :func:`filter_options` reads.
+
+    Args:
+        fit_required: scores alone are no method.
+        threshold: the default.
+    """
     group = parser.add_argument_group("filter")
     group.add_argument(
         "--threshold",
         metavar="PX",
         type=positive(float),
-        default=FilterOptions.threshold,
-        help="pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default 1.0",
+        default=threshold,
+        help=f"pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default {threshold}",
     )
+    parser.set_defaults(usual_threshold=threshold)
     group.add_argument(
         "--keep-precision",
         metavar="P",
@@ -121,7 +129,7 @@ def doubtful_options(options: argparse.Namespace) -> list[str]:
         )
     if options.threshold > _HUGE_PX:
         doubts.append(f"--threshold {options.threshold:g} is in pixels: matches that far off count as right")
-    if options.keep_precision is not None and options.threshold != FilterOptions.threshold:
+    if options.keep_precision is not None and options.threshold != options.usual_threshold:
         doubts.append("--keep-precision decides what is kept: --threshold has no say")
     if getattr(options, "max_keypoints", DEFAULT_FEATURE_COUNT) < _FEW_KEYPOINTS:
         doubts.append(f"--max-keypoints {options.max_keypoints} of an image: too few to tell right matches from chance")

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import MgcaFilterError
 from ..pipelines.run import Report, Summary, Workers
+from ..pipelines.worker import MAPPING_THRESHOLD_PX
 from .arguments import (
     EXIT_FOUND,
     EXIT_NO_GEOMETRY,
@@ -114,7 +115,7 @@ def _add_folder(commands: Any) -> argparse.ArgumentParser:
 
 
 def _add_common(command: argparse.ArgumentParser) -> None:
-    add_filter_options(command, fit_required=True)
+    add_filter_options(command, fit_required=True, threshold=MAPPING_THRESHOLD_PX)
     workers = command.add_argument_group("workers")
     workers.add_argument("-j", "--jobs", metavar="N", type=positive(int), default=1, help="workers, default 1")
     workers.add_argument("--engine", choices=("local", "ray"), default="local", help="processes here (default), or Ray")

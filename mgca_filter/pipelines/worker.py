@@ -33,6 +33,8 @@ from ..match_filter import MatchFilter
 from ..result import EXPLAINED, FilterResult, Status
 
 FAILED = "failed"
+# Half of what COLMAP's own verification lets pass: nearly as many points, and the most accurate poses.
+MAPPING_THRESHOLD_PX = 2.0
 
 
 @dataclass(frozen=True)

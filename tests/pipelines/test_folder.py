@@ -29,7 +29,7 @@ from mgca_filter.images import intrinsics_as_shown
 from mgca_filter.pipelines.folder import FolderJob, camera_size, exhaustive_pairs, read_pairs, sequential_pairs
 from mgca_filter.pipelines.journal import PipelineError
 from mgca_filter.pipelines.stored_pixels import stored_row
-from mgca_filter.pipelines.worker import PairRow
+from mgca_filter.pipelines.worker import MAPPING_THRESHOLD_PX, PairRow
 
 # A quarter of the default: the laws are about the run, not about the matches.
 KEYPOINTS = 1000
@@ -62,7 +62,9 @@ def test_rows_equal_match_images(image_folder, views, expected):
     assert [(row["image1"], row["image2"]) for row in rows] == exhaustive_pairs([view.name for view in views])
     for row in rows:
         view1, view2 = (next(v for v in views if v.name == row[key]) for key in ("image1", "image2"))
-        alone = match_images(view1.image, view2.image, K1=view1.K, max_keypoints=KEYPOINTS)
+        alone = match_images(
+            view1.image, view2.image, K1=view1.K, max_keypoints=KEYPOINTS, threshold=MAPPING_THRESHOLD_PX
+        )
         assert row["status"] == alone.result.status.value
         assert row["confidence"] == alone.result.confidence
         assert row["num_inliers"] == alone.result.num_inliers == len(row["points1"]) == len(row["scores"])
@@ -235,12 +237,12 @@ def test_resume_with_other_options_is_refused(image_folder, tmp_path, capsys):
 
     (tmp_path / "out.jsonl.work").mkdir()
     journal = Journal(tmp_path / "out.jsonl.work" / "journal.log")
-    journal.begin({"threshold": 2.0})
+    journal.begin({"threshold": 3.0})
     assert run(image_folder, tmp_path / "out.jsonl") == 2
     assert_one_line(capsys.readouterr(), "journal.log", "locked by another process")
     journal.close()
     assert run(image_folder, tmp_path / "out.jsonl") == 2
-    assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 2.0 instead of 1.0")
+    assert_one_line(capsys.readouterr(), "out.jsonl.work", "threshold 3.0 instead of 2.0")
 
 
 def test_resume_with_another_model_of_the_same_name_is_refused(image_folder, tmp_path, monkeypatch, capsys):
@@ -520,7 +522,7 @@ def test_what_colmap_and_hloc_get_is_in_the_pixels_of_the_files(held_sideways, t
     np.testing.assert_array_equal(turned_geometry.inlier_matches, geometry.inlier_matches)
     kept = geometry.inlier_matches
     points1, points2 = sideways[0][kept[:, 0], :2], sideways[1][kept[:, 1], :2]
-    assert sampson_distance(np.hstack([points1, points2]), turned_geometry.F).max() < 1.1
+    assert sampson_distance(np.hstack([points1, points2]), turned_geometry.F).max() < MAPPING_THRESHOLD_PX + 0.1
     # The turned camera sees every point turned with it, about its own axis.
     S = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
     R = turned_geometry.cam2_from_cam1.rotation.matrix()
