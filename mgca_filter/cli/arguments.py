@@ -67,7 +67,7 @@ def add_filter_options(
         metavar="PX",
         type=positive(float),
         default=threshold,
-        help=f"pixels of the copy of at most 1200 that is searched for keypoints (or of a database), default {threshold}",
+        help=f"pixels of the copy of at most 1200 searched for keypoints (or of a database), default {threshold:g}",
     )
     parser.set_defaults(usual_threshold=threshold)
     group.add_argument(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import cross_matrix, homogeneous
+from ..geometry.epipolar import cross_matrix, homogeneous_columns
 from ..geometry.pose_refinement import rotation_from_vector
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ class FocalPairFit:
     """
 
     def __init__(self, rows: Array, threshold: float, noise: float, belief: FocalBelief) -> None:
-        self._x1, self._x2 = homogeneous(rows[:, :2]), homogeneous(rows[:, 2:])
+        self._x1, self._x2 = homogeneous_columns(rows[:, :2]), homogeneous_columns(rows[:, 2:])  # (3, N)
         self._threshold, self._belief = threshold, belief
         self._scale = 1.0 / (TEMPER * noise**2)
 
@@ -154,11 +154,14 @@ class FocalPairFit:
 
         Next to zero a distance without sign has no derivative.
         """
-        shrink1, shrink2 = (np.diag([np.exp(-log), np.exp(-log), 1.0]) for log in logs)
-        M = shrink2 @ cross_matrix(t) @ R @ shrink1
-        lines2, lines1 = self._x1 @ M.T, self._x2 @ M
-        squared_norm = np.sum(lines2[:, :2] ** 2, axis=1) + np.sum(lines1[:, :2] ** 2, axis=1)
-        error = np.sum(self._x2 * lines2, axis=1)
+        return np.asarray(self._distances_to(_matrix_under(R, t, logs)[None])[0])
+
+    def _distances_to(self, M: Array) -> Array:
+        """The same (K, N) of matrices (K, 3, 3), x2^T M x1 = 0."""
+        lines2, normals1 = M @ self._x1, M.transpose(0, 2, 1)[:, :2] @ self._x2  # (K, 3, N), (K, 2, N)
+        squared_norm = np.einsum("kin,kin->kn", lines2[:, :2], lines2[:, :2])
+        squared_norm += np.einsum("kin,kin->kn", normals1, normals1)
+        error = np.einsum("in,kin->kn", self._x2, lines2)
         return np.asarray(error / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny)))
 
     def _cost(self, distance: Array, logs: Array) -> float:
@@ -179,12 +182,16 @@ class FocalPairFit:
 
     def _jacobian(self, R: Array, t: Array, logs: Array, distance: Array) -> Array:
         """Derivatives (K, 7) of the distances within the threshold."""
-        near = np.abs(distance) < self._threshold
-        columns = [
-            (self._distances(*_moved(R, t, logs, _DIFFERENCE * unit))[near] - distance[near]) / _DIFFERENCE
-            for unit in np.eye(7)
-        ]
-        return np.stack(columns, axis=1)
+        moved = np.stack([_matrix_under(*_moved(R, t, logs, _DIFFERENCE * unit)) for unit in np.eye(7)])
+        derivatives = (self._distances_to(moved) - distance) / _DIFFERENCE
+        return np.asarray(derivatives[:, np.abs(distance) < self._threshold].T)
+
+
+def _matrix_under(R: Array, t: Array, logs: Array) -> Array:
+    """(3, 3) for the image planes of the guessed focal lengths, x2^T M x1 = 0, of a pose under other ones."""
+    shrink1, shrink2 = (np.diag([np.exp(-log), np.exp(-log), 1.0]) for log in logs)
+    M: Array = shrink2 @ cross_matrix(t) @ R @ shrink1
+    return M
 
 
 def _moved(R: Array, t: Array, logs: Array, step: Array) -> tuple[Array, Array, Array]:
