@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.epipolar import cross_matrix, homogeneous_columns
-from ..geometry.pose_refinement import rotation_from_vector
+from ..geometry.pose_refinement import apply_step
 
 Array = NDArray[np.float64]
 
@@ -196,6 +196,4 @@ def _matrix_under(R: Array, t: Array, logs: Array) -> Array:
 
 def _moved(R: Array, t: Array, logs: Array, step: Array) -> tuple[Array, Array, Array]:
     """Pose and logarithms after a step (7,)."""
-    across = np.linalg.svd(t[None])[2][1:]
-    moved = t + step[3:5] @ across
-    return rotation_from_vector(step[:3]) @ R, moved / np.linalg.norm(moved), logs + step[5:]
+    return *apply_step(R, t, step[:5]), logs + step[5:]

@@ -165,7 +165,7 @@ def _direction_spread_deg(inliers: Array, R: Array, t: Array, noise: float, scal
     turn = np.linspace(0.0, 2.0 * np.pi, _SPOKES, endpoint=False)
     across = np.stack([np.cos(turn), np.sin(turn)], axis=1)  # (S, 2)
     ring, spoke = np.repeat(np.arange(_RINGS), _SPOKES), np.tile(np.arange(_SPOKES), _RINGS)
-    offsets = across[spoke] @ _tangent_basis(t)
+    offsets = across[spoke] @ tangent_basis(t)
     directions = np.cos(angle[ring])[:, None] * t + np.sin(angle[ring])[:, None] * offsets  # (D, 3)
     costs = costs_of_directions(rows, R, np.vstack([t, directions]))
     costs = step * (costs[1:] - costs[0])
@@ -230,7 +230,7 @@ class SampsonTerms:
     def derivatives(self) -> Array:
         """Derivatives (5, N) of the residuals by a rotation on the left of R and two steps of t, normals held fixed."""
         T = cross_matrix(self.t)
-        across = (_tangent_basis(self.t) @ _TURNS.reshape(3, 9)).reshape(2, 3, 3)
+        across = (tangent_basis(self.t) @ _TURNS.reshape(3, 9)).reshape(2, 3, 3)
         of_E = np.concatenate([T @ _TURNS, across]) @ self.R  # (5, 3, 3)
         return np.asarray(np.einsum("kin,in->kn", of_E @ self._x1, self._x2 * self._scale))
 
@@ -251,7 +251,7 @@ def _truncated(residual: Array, threshold: float) -> tuple[float, Array]:
     return float(np.minimum(squared, threshold**2).sum()), (squared < threshold**2).astype(np.float64)
 
 
-def _tangent_basis(t: Array) -> Array:
+def tangent_basis(t: Array) -> Array:
     """Two unit vectors (2, 3) orthogonal to ``t``."""
     x, y, z = t.tolist()
     sizes = [abs(x), abs(y), abs(z)]
@@ -269,5 +269,5 @@ def rotation_from_vector(vector: Array) -> Array:
 
 def apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     """The pose after a step (5,): a rotation vector on the left of R, then two moves across ``t``."""
-    moved = t + step[3:] @ _tangent_basis(t)
+    moved = t + step[3:] @ tangent_basis(t)
     return rotation_from_vector(step[:3]) @ R, moved / sqrt(moved @ moved)
