@@ -130,7 +130,7 @@ double log_likelihood(const Residuals& residual, const std::vector<double>& odds
         const double density = mixture_density(squared, scale, coefficients);
         if (density > 0.0) {
             const double sign = residual.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0;
-            sum += counts[i] * std::log1p(odds[i] / residual.noise[i] * sign * density);
+            sum += counts[i] * std::log1p(odds[i] * sign * density);
         }
     }
     return sum;
@@ -156,17 +156,14 @@ Coefficients Coefficients::read(const Json& values) {
     return c;
 }
 
-Residuals measure_residuals(const Correspondences& matches, const std::vector<double>& noise, const Pose& pose,
-                            double focal_px) {
+Residuals measure_residuals(const Correspondences& matches, const Pose& pose, double focal_px) {
     Residuals residuals;
-    residuals.noise = noise;
     residuals.distance_px.reserve(matches.size());
     residuals.behind.reserve(matches.size());
     const double* R = pose.R.val;
     const double t0 = pose.t[0], t1 = pose.t[1], t2 = pose.t[2];
     const double least_parallax = (kMinParallaxPx / focal_px) * (kMinParallaxPx / focal_px);
-    for (std::size_t i = 0; i < matches.size(); ++i) {
-        const Correspondence& match = matches[i];
+    for (const Correspondence& match : matches) {
         const double x1 = match[0], y1 = match[1], x2 = match[2], y2 = match[3];
         const double r0 = R[0] * x1 + R[1] * y1 + R[2], r1 = R[3] * x1 + R[4] * y1 + R[5],
                      r2 = R[6] * x1 + R[7] * y1 + R[8];
@@ -176,7 +173,7 @@ Residuals measure_residuals(const Correspondences& matches, const std::vector<do
         const double m0 = R[0] * n0 + R[3] * n1 + R[6] * n2, m1 = R[1] * n0 + R[4] * n1 + R[7] * n2;
         const double squared_norm =
             std::max(l0 * l0 + l1 * l1 + m0 * m0 + m1 * m1, std::numeric_limits<double>::min());
-        residuals.distance_px.push_back(std::abs(error) * (focal_px / (noise[i] * std::sqrt(squared_norm))));
+        residuals.distance_px.push_back(std::abs(error) * (focal_px / std::sqrt(squared_norm)));
         // A rotation keeps the length of a ray.
         const double aa = x1 * x1 + y1 * y1 + 1.0, bb = x2 * x2 + y2 * y2 + 1.0, ab = r0 * x2 + r1 * y2 + r2;
         const double at = r0 * t0 + r1 * t1 + r2 * t2, bt = x2 * t0 + y2 * t1 + t2;
@@ -246,8 +243,7 @@ std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& r
     return likelihoods;
 }
 
-Judgement judge_hypotheses(const Correspondences& matches, const std::vector<double>& noise,
-                           const std::optional<std::vector<double>>& scores,
+Judgement judge_hypotheses(const Correspondences& matches, const std::optional<std::vector<double>>& scores,
                            const std::vector<Hypothesis>& hypotheses, double focal_px,
                            const std::vector<Pose>& network_poses, const Coefficients& coefficients) {
     const std::size_t count = matches.size(), number_of_hypotheses = hypotheses.size();
@@ -255,10 +251,10 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::vector<dou
     std::size_t most_inliers = 0;
     std::vector<std::size_t> inliers;
     for (const Hypothesis& hypothesis : hypotheses) {
-        const Residuals& residual = residuals.emplace_back(measure_residuals(matches, noise, hypothesis.pose, focal_px));
+        const Residuals& residual = residuals.emplace_back(measure_residuals(matches, hypothesis.pose, focal_px));
         std::size_t near = 0;
         for (std::size_t i = 0; i < count; ++i) {
-            near += residual.distance_px[i] < kInlierPx && residual.behind[i] == 0 ? 1 : 0;
+            near += residual.distance_px[i] < 1.0 && residual.behind[i] == 0 ? 1 : 0;
         }
         inliers.push_back(near);
         most_inliers = std::max(most_inliers, near);
@@ -357,8 +353,8 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::vector<dou
             around += 1.0;
             weighted_around += weights[i];
         }
-        everything_near += distance < kInlierPx ? 1 : 0;
-        weighted += distance < kInlierPx && front ? weights[i] : 0.0;
+        everything_near += distance < 1.0 ? 1 : 0;
+        weighted += distance < 1.0 && front ? weights[i] : 0.0;
         near_two += distance < 2.0 && front ? counts[i] : 0.0;
         if (distance < 3.0 * kNoisePx * scale && front) {
             firm.push_back(matches[i]);
@@ -432,7 +428,7 @@ std::vector<double> posterior(const Residuals& residuals, const std::vector<Mask
     for (std::size_t i = 0; i < count; ++i) {
         const double squared = residuals.distance_px[i] * residuals.distance_px[i];
         const double density = std::sqrt(2.0 / CV_PI) * mixture_density(squared, scale, coefficients);
-        ratio.push_back(coefficients.outlier_width_px[0] * density / residuals.noise[i] *
+        ratio.push_back(coefficients.outlier_width_px[0] * density *
                         (residuals.behind[i] != 0 ? coefficients.seen_behind[0] : 1.0));
     }
     for (const Mask& group : groups) {

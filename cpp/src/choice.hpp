@@ -44,9 +44,6 @@ enum class Feature : std::size_t {
 };
 constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);
 
-// Matches within this distance are explained.
-constexpr double kInlierPx = 1.0;
-
 /// Coefficients by name, from the model file.
 struct Coefficients {
     std::vector<double> score_trust, noise_px, noise_weights, noise_scales, outlier_width_px, seen_behind, early_end,
@@ -64,9 +61,8 @@ struct Hypothesis {
 
 /// Residuals of one hypothesis on N matches.
 struct Residuals {
-    std::vector<double> distance_px;  // Sampson distances, each over the noise of its match
+    std::vector<double> distance_px;  // Sampson distances
     Mask behind;  // 1 where a match lies behind a camera and its rays are not nearly parallel
-    std::vector<double> noise;  // of the matches, relative to the usual one's
 };
 
 /// The chosen hypothesis.
@@ -78,9 +74,7 @@ struct Judgement {
     double operator[](Feature feature) const { return features[static_cast<std::size_t>(feature)]; }
 };
 
-/// @param noise of the matches, relative to the usual one's.
-Residuals measure_residuals(const Correspondences& matches, const std::vector<double>& noise, const Pose& pose,
-                            double focal_px);
+Residuals measure_residuals(const Correspondences& matches, const Pose& pose, double focal_px);
 
 /// Larger of the angles of rotation and of direction (sign ignored) between two poses, degrees.
 double pose_angle_deg(const Pose& a, const Pose& b);
@@ -103,11 +97,9 @@ double score_prior(double score, const Coefficients& coefficients);
 
 /// Choose among hypotheses, at least one, and measure the chosen one.
 ///
-/// @param matches each keypoint once. noise: of the matches, relative to the usual one's.
-/// @param scores probabilities of the matches, nothing before the network.
+/// @param matches each keypoint once. scores: probabilities of the matches, nothing before the network.
 /// @param network_poses the poses that the network's own E allows, or none.
-Judgement judge_hypotheses(const Correspondences& matches, const std::vector<double>& noise,
-                           const std::optional<std::vector<double>>& scores,
+Judgement judge_hypotheses(const Correspondences& matches, const std::optional<std::vector<double>>& scores,
                            const std::vector<Hypothesis>& hypotheses, double focal_px,
                            const std::vector<Pose>& network_poses, const Coefficients& coefficients);
 

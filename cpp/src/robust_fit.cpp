@@ -146,7 +146,6 @@ void Search::take(Evidence evidence) {
     evidence_ = std::move(evidence);
     judgement_.reset();
     judged_ = select(evidence_.correspondences, evidence_.once);
-    noise_ = select(evidence_.noise, evidence_.once);
     Mask fitted = evidence_.listed;
     std::size_t count = 0;
     for (std::size_t i = 0; i < fitted.size(); ++i) {
@@ -206,8 +205,7 @@ void Search::add(Found found) {
 }
 
 int Search::near(const Pose& pose) const {
-    const Residuals residuals =
-        measure_residuals(fitted_, std::vector<double>(fitted_.size(), 1.0), pose, evidence_.focal_px);
+    const Residuals residuals = measure_residuals(fitted_, pose, evidence_.focal_px);
     int count = 0;
     for (std::size_t i = 0; i < fitted_.size(); ++i) {
         count += residuals.distance_px[i] < 2.0 && residuals.behind[i] == 0 ? 1 : 0;
@@ -239,8 +237,8 @@ const Judgement& Search::judge() {
         if (evidence_.network) {
             scores = select(evidence_.network->scores, evidence_.once);
         }
-        judgement_ = judge_hypotheses(judged_, noise_, scores, hypotheses, evidence_.focal_px,
-                                      poses_of_network(evidence_), coefficients_);
+        judgement_ = judge_hypotheses(judged_, scores, hypotheses, evidence_.focal_px, poses_of_network(evidence_),
+                                      coefficients_);
     }
     return *judgement_;
 }
@@ -269,10 +267,10 @@ TwoViewModel Search::refined(TwoViewModel model) const {
             weight = 1.0 - (1.0 - weight) * (1.0 - right / (right + wrong));
         }
     }
-    const Residuals residuals = measure_residuals(judged_, noise_, model.pose, evidence_.focal_px);
+    const Residuals residuals = measure_residuals(judged_, model.pose, evidence_.focal_px);
     std::vector<double> inliers;
     for (std::size_t i = 0; i < judged_.size(); ++i) {
-        if (residuals.distance_px[i] < kInlierPx && residuals.behind[i] == 0) {
+        if (residuals.distance_px[i] < 1.0 && residuals.behind[i] == 0) {
             inliers.push_back(residuals.distance_px[i]);
         }
     }
@@ -280,7 +278,7 @@ TwoViewModel Search::refined(TwoViewModel model) const {
         inliers.empty() ? kHalfWeightPx
                         : std::clamp(kHalfWeightMedians * median(inliers), kLeastHalfWeightPx, kHalfWeightPx);
     std::vector<double> scale;
-    for (const double noise : noise_) {
+    for (const double noise : select(evidence_.noise, evidence_.once)) {
         scale.push_back(half_px * noise / evidence_.focal_px);
     }
     model.pose = refine_pose_by_weights(judged_, model.pose, scale, weights, kLastReachPx / evidence_.focal_px);
@@ -305,7 +303,6 @@ std::optional<TwoViewModel> Search::fundamental() {
                 distance *= evidence_.focal_px;
             }
             residual.behind.assign(judged_.size(), 0);
-            residual.noise.assign(judged_.size(), 1.0);
         }
     }
     if (found.empty()) {
@@ -338,17 +335,15 @@ std::vector<float> scores_by_residuals(const PairInput& pair, const TwoViewModel
                                        const Coefficients& coefficients) {
     const Mask listed = listed_rows(pair.attributes, pair.valid);
     Correspondences valid;
-    std::vector<double> noise;
     std::vector<Mask> groups(2);
     for (std::size_t i = 0; i < pair.valid.size(); ++i) {
         if (pair.valid[i] != 0) {
             valid.push_back(pair.correspondences[i]);
-            noise.push_back(pair.noise[i]);
             groups[0].push_back(listed[i] != 0 ? 1 : 0);
             groups[1].push_back(listed[i] != 0 ? 0 : 1);
         }
     }
-    const Residuals residuals = measure_residuals(valid, noise, model.pose, pair.focal_px());
+    const Residuals residuals = measure_residuals(valid, model.pose, pair.focal_px());
     const double scale = model.judgement ? model.judgement->scale : 1.0;
     const std::vector<double> probability = posterior(residuals, groups, scale, coefficients);
     std::vector<float> scores(pair.valid.size(), 0.0F);
@@ -377,8 +372,7 @@ std::optional<Pose> pose_from_essential(const cv::Matx33d& E, const Corresponden
     std::optional<Pose> best;
     std::ptrdiff_t fewest = 0;
     for (const Pose& pose : decompose_essential(project_to_essential(E))) {
-        const Residuals residuals =
-            measure_residuals(near, std::vector<double>(near.size(), 1.0), pose, focal_px);
+        const Residuals residuals = measure_residuals(near, pose, focal_px);
         const std::ptrdiff_t behind = std::count(residuals.behind.begin(), residuals.behind.end(), 1);
         if (!best || behind < fewest) {
             best = pose;

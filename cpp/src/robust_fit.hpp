@@ -71,7 +71,6 @@ private:
     const Options& options_;
     Evidence evidence_;
     Correspondences judged_, fitted_;
-    std::vector<double> noise_;  // of those that are judged
     std::vector<Found> poses_;
     std::optional<Pose> twins_of_;
     std::optional<Judgement> judgement_;

@@ -384,21 +384,20 @@ void the_likelier_hypothesis_is_chosen() {
     matches.insert(matches.end(), wrong.begin(), wrong.end());
     std::vector<double> scores(160, 0.1);
     std::fill(scores.begin(), scores.begin() + 80, 0.9);
-    const std::vector<double> alike(160, 1.0);
     const Pose other{rotation_from_vector({0.3, 0.0, 0.1}), {0.0, 0.0, 1.0}};
     const std::vector<Hypothesis> hypotheses{{other, Family::network}, {kPose, Family::accepted}};
     Coefficients c = coefficients();
-    const Judgement judged = judge_hypotheses(matches, alike, scores, hypotheses, kFocal, {}, c);
+    const Judgement judged = judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c);
     check::equal(judged.chosen, std::size_t{1}, "the true pose");
     check::that(judged[Feature::likelihood_to_alternative] > 3.0, "far from its alternative");
     check::near(judged[Feature::no_network], 1.0, 0.0, "no network E");
-    check::equal(judge_hypotheses(matches, alike, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
+    check::equal(judge_hypotheses(matches, std::nullopt, hypotheses, kFocal, {}, c).chosen, std::size_t{1},
                  "without scores as well");
     // Confidence is the logistic function of the weighted features.
     check::near(confidence(judged, c), 1.0 / (1.0 + std::exp(-judged[Feature::log_count])), 1e-12, "confidence");
     check::near(early_confidence(judged, c), 1.0 / (1.0 + std::exp(-1.0)), 1e-12, "early confidence");
     c.support_weight = {-1e3};  // relative support against itself: the worst supported one wins
-    check::equal(judge_hypotheses(matches, alike, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
+    check::equal(judge_hypotheses(matches, scores, hypotheses, kFocal, {}, c).chosen, std::size_t{0},
                  "support_weight is felt");
     check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse("{}")); }, "score_trust is missing");
     check::throws<std::invalid_argument>([] { Coefficients::read(Json::parse(R"({"score_trust": [1]})")); },
@@ -410,9 +409,7 @@ void residuals_become_scores() {
     Correspondences all = matches;
     const Correspondences wrong = draw_wrong(60, 12);
     all.insert(all.end(), wrong.begin(), wrong.end());
-    const Residuals residuals = measure_residuals(all, std::vector<double>(120, 1.0), kPose, kFocal);
-    const Residuals coarse = measure_residuals(all, std::vector<double>(120, 2.0), kPose, kFocal);
-    check::near(coarse.distance_px[7], 0.5 * residuals.distance_px[7], 1e-12, "in units of the noise of a match");
+    const Residuals residuals = measure_residuals(all, kPose, kFocal);
     const std::vector<double> scores = posterior(residuals, {Mask(120, 1)}, 1.0, coefficients());
     const double right = std::accumulate(scores.begin(), scores.begin() + 60, 0.0) / 60.0;
     const double mistaken = std::accumulate(scores.begin() + 60, scores.end(), 0.0) / 60.0;

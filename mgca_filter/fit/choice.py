@@ -136,14 +136,12 @@ class Residuals:
     """Hypotheses on matches.
 
     Attributes:
-        distance_px: (H, N) Sampson distances in pixels, each over the noise of its match.
+        distance_px: (H, N) Sampson distances in pixels.
         behind: (H, N) True where a match lies behind a camera and its rays are not nearly parallel.
-        noise: (N,) of the matches, relative to the usual one's.
     """
 
     distance_px: Array
     behind: BoolArray
-    noise: Array | float = 1.0
 
 
 @dataclass(frozen=True)
@@ -154,8 +152,7 @@ class Judgement:
         chosen: its position.
         features: what is known of it, by the names of :data:`FEATURES`.
         likelihood: (H,) log-likelihood ratios of all hypotheses.
-        distance_px: (N,) Sampson distances of the matches to it, each over the noise of its match; infinite where a
-            match lies behind a camera.
+        distance_px: (N,) Sampson distances of the matches to it; infinite where a match lies behind a camera.
         share: of right matches under it.
         scale: of the noise, by which :data:`NOISE_PX` is multiplied.
     """
@@ -168,17 +165,11 @@ class Judgement:
     scale: float
 
 
-def measure_residuals(
-    correspondences: Array, R: Array, t: Array, focal_px: float, noise: Array | float = 1.0
-) -> Residuals:
-    """Residuals of poses R (H, 3, 3), t (H, 3) on matches (N, 4) of the normalised image planes.
-
-    Args:
-        noise: (N,) of the matches, relative to the usual one's.
-    """
+def measure_residuals(correspondences: Array, R: Array, t: Array, focal_px: float) -> Residuals:
+    """Residuals of poses R (H, 3, 3), t (H, 3) on matches (N, 4) of the normalised image planes."""
     E = np.stack([cross_matrix(one) for one in t]) @ R
-    distance_px = sampson_distance(correspondences, E) * (focal_px / noise)
-    return Residuals(distance_px, lie_behind(correspondences, R, t, focal_px), noise)
+    distance_px = sampson_distance(correspondences, E) * focal_px
+    return Residuals(distance_px, lie_behind(correspondences, R, t, focal_px))
 
 
 def lie_behind(correspondences: Array, R: Array, t: Array, focal_px: float) -> BoolArray:
@@ -238,7 +229,7 @@ def log_likelihoods(
             all the same, because they are off *along* their epipolar line, as in a corridor walked down.
     """
     odds = coefficients["outlier_width_px"][0] * np.sqrt(2.0 / np.pi) * probability / (1.0 - probability)  # (N,)
-    odds = odds / residuals.noise * np.where(residuals.behind, coefficients["seen_behind"][0], 1.0)  # (H, N)
+    odds = odds * np.where(residuals.behind, coefficients["seen_behind"][0], 1.0)  # (H, N)
     squared = residuals.distance_px**2
     columns = []
     for scale in coefficients["noise_scales"]:
@@ -278,7 +269,6 @@ def judge(
     focal_px: float,
     network_poses: tuple[Array, Array] | None,
     coefficients: Coefficients,
-    noise: Array | float = 1.0,
 ) -> Judgement:
     """Choose among hypotheses and measure the chosen one.
 
@@ -288,9 +278,8 @@ def judge(
         focal_px: mean focal length, pixels.
         network_poses: R (G, 3, 3), t (G, 3): the poses that the network E allows, or None.
         coefficients: see :func:`log_likelihoods` and :func:`prior`.
-        noise: (N,) of the matches, relative to the usual one's.
     """
-    residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px, noise)
+    residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px)
     distance, front = residuals.distance_px, ~residuals.behind
     count = len(correspondences)
     near = (distance < INLIER_PX) & front  # (H, N)
@@ -413,7 +402,7 @@ def posterior(residuals: Residuals, groups: Sequence[BoolArray], scale: float, c
     density = np.zeros_like(squared)
     for sigma, weight in zip(coefficients["noise_px"], coefficients["noise_weights"]):
         density += np.sqrt(2.0 / np.pi) * (weight / (scale * sigma)) * np.exp((-0.5 / (scale * sigma) ** 2) * squared)
-    ratio = coefficients["outlier_width_px"][0] * density / residuals.noise
+    ratio = coefficients["outlier_width_px"][0] * density
     ratio = ratio * np.where(residuals.behind[0], coefficients["seen_behind"][0], 1.0)
     probability = np.zeros_like(squared)
     for group in groups:

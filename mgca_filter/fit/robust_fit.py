@@ -195,7 +195,7 @@ class Search:
 
     def _take(self, evidence: Evidence) -> None:
         self._evidence, self._judgement = evidence, None
-        self._judged, self._noise = evidence.correspondences[evidence.once], evidence.noise[evidence.once]
+        self._judged = evidence.correspondences[evidence.once]
         fitted = evidence.listed
         if evidence.scores is not None:
             fitted = fitted | (evidence.scores > ACCEPTED_SCORE)
@@ -229,7 +229,7 @@ class Search:
         self._plane = sources.dominant_plane(self._evidence, best.R, best.t, self._options.seed)
         found = [pose_from_essential(E, self._fitted, self._evidence.focal_px) for E in sources.plane(self._plane)]
         twins = [_Pose(*pose, Family.PLANE, "plane") for pose in found if pose is not None]
-        near = self._near([best, *twins], self._fitted, TWIN_PX, 1.0)
+        near = self._near([best, *twins], self._fitted, TWIN_PX)
         for twin, count in zip(twins, near[1:]):
             if count > TWIN_SHARE * near[0] and all(_angle_deg(twin, other) > TWIN_DEG for other in self._poses):
                 self._add(twin)
@@ -245,10 +245,10 @@ class Search:
         self._poses.append(_Pose(R, t, found.family, found.origin))
         self._judgement = None
 
-    def _near(self, poses: Sequence[_Pose], matches: Array, reach_px: float, noise: Array | float) -> list[int]:
-        """Numbers of matches (N, 4) of a noise (N,) within a distance of each pose and in front of it."""
+    def _near(self, poses: Sequence[_Pose], matches: Array, reach_px: float) -> list[int]:
+        """Numbers of matches (N, 4) within a distance of each pose and in front of it."""
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px, noise)
+        residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px)
         near = (residuals.distance_px < reach_px) & ~residuals.behind
         return [int(count) for count in near.sum(axis=1)]
 
@@ -260,7 +260,7 @@ class Search:
         """Share of the matches that the best of what was found explains."""
         if not self._poses:
             return 0.0
-        inliers = self._near([self._best()], self._judged, choice.INLIER_PX, self._noise)[0]
+        inliers = self._near([self._best()], self._judged, choice.INLIER_PX)[0]
         return choice.explained_share(inliers, len(self._judged))
 
     def _settled(self) -> bool:
@@ -293,7 +293,6 @@ class Search:
                 evidence.focal_px,
                 _poses_of_network(evidence),
                 self._coefficients,
-                self._noise,
             )
         return self._judgement
 
@@ -326,9 +325,8 @@ class Search:
         median = float(np.median(inliers)) if len(inliers) else HALF_WEIGHT_PX
         half_px = min(max(HALF_WEIGHT_MEDIANS * median, LEAST_HALF_WEIGHT_PX), HALF_WEIGHT_PX)
         pixel = 1.0 / evidence.focal_px
-        R, t = refine_pose_by_weights(
-            self._judged, model.R, model.t, half_px * pixel * self._noise, weights, LAST_REACH_PX * pixel
-        )
+        scale = half_px * pixel * evidence.noise[evidence.once]
+        R, t = refine_pose_by_weights(self._judged, model.R, model.t, scale, weights, LAST_REACH_PX * pixel)
         E = essential_from_pose(R, t)
         return replace(model, M=E, E=E, R=R, t=t)
 
@@ -360,9 +358,7 @@ def scores_by_residuals(pair: PairInput, model: TwoViewModel, coefficients: Coef
     """Scores (M,) of a pair that ended before the network, from the residuals of its matches to the model."""
     valid, listed = pair.valid, listed_rows(pair.attributes, pair.valid)
     scores = np.zeros(len(valid), dtype=np.float32)
-    residuals = choice.measure_residuals(
-        pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px, pair.noise[valid]
-    )
+    residuals = choice.measure_residuals(pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px)
     scale = 1.0 if model.judgement is None else model.judgement.scale
     groups = (listed[valid], ~listed[valid])
     scores[valid] = choice.posterior(residuals, groups, scale, coefficients)

@@ -87,24 +87,6 @@ def test_exact_points_have_no_residual() -> None:
     assert measure_residuals(normalized(exact), exact.R[None], -exact.t[None], FOCAL).behind.all()
 
 
-def test_residuals_are_in_units_of_the_noise_of_each_match(scene: Scene) -> None:
-    noise = np.random.default_rng(0).uniform(0.4, 3.0, len(scene.inlier))
-    alike = measure_residuals(normalized(scene), scene.R[None], scene.t[None], FOCAL)
-    own = measure_residuals(normalized(scene), scene.R[None], scene.t[None], FOCAL, noise)
-    np.testing.assert_allclose(own.distance_px * noise, alike.distance_px)
-    np.testing.assert_array_equal(own.behind, alike.behind)
-
-
-def test_large_keypoints_that_are_near_by_chance_do_not_outvote_small_ones() -> None:
-    # Two poses, and two sets of matches of which each agrees with one, the second by chance: its matches are coarse.
-    small, large = make_scene(wrong=0, right=60, noise_px=0.15), make_scene("wide", wrong=0, right=66, noise_px=0.15)
-    rows = np.vstack([normalized(small), normalized(large)])
-    poses = Hypotheses(np.stack([large.R, small.R]), np.stack([large.t, small.t]), np.arange(2))
-    noise = np.where(np.arange(126) < 60, 0.4, 3.0)
-    assert judge(rows, None, poses, FOCAL, None, COEFFICIENTS, noise).chosen == 1
-    assert judge(rows, None, poses, FOCAL, None, COEFFICIENTS, 1.0).chosen == 0
-
-
 def test_nearly_parallel_rays_say_nothing_of_depths() -> None:
     far = make_scene("rotation", wrong=0)
     for t in (np.array([1.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0])):

@@ -96,7 +96,8 @@ def test_large_images_are_judged_in_the_copy_that_was_searched(tmp_path, views):
     assert cli.main(["folder", str(tmp_path / "images"), "-o", str(tmp_path / "out.jsonl"), *words]) == 0
     (row,) = read_rows(tmp_path / "out.jsonl")
     alone, strict = (
-        match_images(*large, K1=K, max_keypoints=KEYPOINTS, **options) for options in ({}, {"resolution": 1.0})
+        match_images(*large, K1=K, max_keypoints=KEYPOINTS, threshold=MAPPING_THRESHOLD_PX, **options)
+        for options in ({}, {"resolution": 1.0})
     )
     assert row["num_inliers"] == alone.result.num_inliers > strict.result.num_inliers
 
