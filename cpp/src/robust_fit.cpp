@@ -100,7 +100,7 @@ std::optional<TwoViewModel> Search::before_network() {
     if (!model || !explains_list(*model->judgement, coefficients_)) {
         return std::nullopt;
     }
-    return refined(std::move(*model));
+    return refined(std::move(model));
 }
 
 std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
@@ -114,8 +114,7 @@ std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
     if (const auto one = alone(options_.method)) {
         poses_.clear();
         propose({*one});
-        std::optional<TwoViewModel> model = chosen("all sources");
-        return model ? std::optional(refined(std::move(*model))) : std::nullopt;
+        return refined(chosen("all sources"));
     }
     propose({kNetwork, kAccepted, kScoreOrder});
     const char* ended = "first sources";
@@ -138,8 +137,7 @@ std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
     if (!poses_.empty()) {
         propose_twins();
     }
-    std::optional<TwoViewModel> model = chosen(ended);
-    return model ? std::optional(refined(std::move(*model))) : std::nullopt;
+    return refined(chosen(ended));
 }
 
 void Search::take(Evidence evidence) {
@@ -255,19 +253,22 @@ std::optional<TwoViewModel> Search::chosen(const char* ended) {
     return TwoViewModel{E, E, pose.pose, pose.origin, ended, confidence, judgement};
 }
 
-TwoViewModel Search::refined(TwoViewModel model) const {
+std::optional<TwoViewModel> Search::refined(std::optional<TwoViewModel> model) const {
+    if (!model) {
+        return std::nullopt;
+    }
     // A match counts by its noise and by the probability that it is right: its score, more where most of the list agrees
     // with the pose, for then the list knows better.
     std::vector<double> weights(judged_.size(), 1.0);
     if (evidence_.network) {
         weights = select(evidence_.network->scores, evidence_.once);
-        const double share = std::exp((*model.judgement)[Feature::log_share]);
+        const double share = std::exp((*model->judgement)[Feature::log_share]);
         const double right = std::pow(share, 3), wrong = std::pow(1.0 - share, 3);
         for (double& weight : weights) {
             weight = 1.0 - (1.0 - weight) * (1.0 - right / (right + wrong));
         }
     }
-    const Residuals residuals = measure_residuals(judged_, model.pose, evidence_.focal_px);
+    const Residuals residuals = measure_residuals(judged_, model->pose, evidence_.focal_px);
     std::vector<double> inliers;
     for (std::size_t i = 0; i < judged_.size(); ++i) {
         if (residuals.distance_px[i] < 1.0 && residuals.behind[i] == 0) {
@@ -281,8 +282,8 @@ TwoViewModel Search::refined(TwoViewModel model) const {
     for (const double noise : select(evidence_.noise, evidence_.once)) {
         scale.push_back(half_px * noise / evidence_.focal_px);
     }
-    model.pose = refine_pose_by_weights(judged_, model.pose, scale, weights, kLastReachPx / evidence_.focal_px);
-    model.M = model.E = essential_from_pose(model.pose);
+    model->pose = refine_pose_by_weights(judged_, model->pose, scale, weights, kLastReachPx / evidence_.focal_px);
+    model->M = model->E = essential_from_pose(model->pose);
     return model;
 }
 

@@ -64,7 +64,7 @@ private:
     bool settled();
     const Judgement& judge();
     std::optional<TwoViewModel> chosen(const char* ended);
-    TwoViewModel refined(TwoViewModel model) const;
+    std::optional<TwoViewModel> refined(std::optional<TwoViewModel> model) const;
     std::optional<TwoViewModel> fundamental();
 
     const Coefficients& coefficients_;

@@ -46,14 +46,11 @@ def refine_pose(correspondences: Array, R: Array, t: Array, threshold: float, ro
     Returns:
         The refined R, t; its truncated cost is never above the one it started from.
     """
-    x1, x2 = _columns(correspondences)
-    residual = SampsonTerms(x1, x2, R, t).residual
-    reached = np.abs(residual) < REACH * threshold
+    terms = SampsonTerms(*_columns(correspondences), R, t)
+    reached = np.abs(terms.residual) < REACH * threshold
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
-    if not reached.all():
-        x1, x2 = x1[:, reached], x2[:, reached]
-    return _minimise(SampsonTerms(x1, x2, R, t), lambda r: _truncated(r, threshold), rounds, _CONVERGED_DECREASE)
+    return _minimise(terms.take(reached), lambda r: _truncated(r, threshold), rounds, _CONVERGED_DECREASE)
 
 
 def refine_pose_by_weights(
@@ -72,18 +69,19 @@ def refine_pose_by_weights(
     Returns:
         The refined R, t; its cost is never above the one it started from.
     """
-    x1, x2 = _columns(correspondences)
-    reached = np.abs(SampsonTerms(x1, x2, R, t).residual) < reach
+    terms = SampsonTerms(*_columns(correspondences), R, t)
+    reached = np.abs(terms.residual) < reach
     if np.count_nonzero(reached) < MIN_INLIERS:
         return R, t
-    of_squares = weights[reached] / scale[reached] ** 2
+    scale, weights = scale[reached], weights[reached]
+    of_squares = weights / scale**2
     of_squares = of_squares / of_squares.max()
 
     def cauchy(residual: Array) -> tuple[float, Array]:
-        relative = (residual / scale[reached]) ** 2
-        return float((weights[reached] * np.log1p(relative)).sum()), of_squares / (1.0 + relative)
+        relative = (residual / scale) ** 2
+        return float((weights * np.log1p(relative)).sum()), of_squares / (1.0 + relative)
 
-    return _minimise(SampsonTerms(x1[:, reached], x2[:, reached], R, t), cauchy, rounds, _FINELY_CONVERGED_DECREASE)
+    return _minimise(terms.take(reached), cauchy, rounds, _FINELY_CONVERGED_DECREASE)
 
 
 def _minimise(start: SampsonTerms, loss: Loss, rounds: int, converged: float) -> tuple[Array, Array]:
@@ -222,6 +220,10 @@ class SampsonTerms:
         squared_norm = np.einsum("in,in->n", normals, normals)
         self._scale = 1.0 / np.sqrt(np.maximum(squared_norm, np.finfo(np.float64).tiny))
         self.residual = np.einsum("in,in->n", line2, x2) * self._scale
+
+    def take(self, rows: NDArray[np.bool_]) -> SampsonTerms:
+        """Those of a selection (N,) of the matches."""
+        return self if rows.all() else SampsonTerms(self._x1[:, rows], self._x2[:, rows], self.R, self.t)
 
     def moved(self, step: Array) -> SampsonTerms:
         """Those of the pose after a step (5,)."""
