@@ -1,6 +1,6 @@
 #include "attributes.hpp"
 
-#include "degeneracy.hpp"
+#include "statistics.hpp"
 
 #include <algorithm>
 #include <cmath>

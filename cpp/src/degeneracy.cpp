@@ -2,6 +2,7 @@
 
 #include "evidence.hpp"
 #include "homography.hpp"
+#include "statistics.hpp"
 
 #include <algorithm>
 #include <cmath>
@@ -131,16 +132,6 @@ cv::Matx33d fit_rotation(const Correspondences& matches, double threshold) {
     return R;
 }
 
-double median(std::vector<double> values) {
-    const std::size_t half = values.size() / 2;
-    std::nth_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half), values.end());
-    const double upper = values[half];
-    if (values.size() % 2 == 1) {
-        return upper;
-    }
-    return 0.5 * (upper + *std::max_element(values.begin(), values.begin() + static_cast<std::ptrdiff_t>(half)));
-}
-
 bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<double>& epipolar_px) {
     std::vector<double> turned, epipolar;
     for (std::size_t i = 0; i < rotation_px.size(); ++i) {
@@ -167,10 +158,10 @@ bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<
     return cost(turned) - cost(epipolar) < price;
 }
 
-bool explains(const std::vector<double>& distances, double threshold, const Support& support) {
+bool explains(const std::vector<double>& distances, double threshold, const Support& support, int freedom) {
     const double count = std::min(static_cast<double>(distances.size()), static_cast<double>(support.count));
     // Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
-    const double accidents = support.chance_count + 2.0 * std::sqrt(support.chance_count);
+    const double accidents = support.chance_count + 2.0 * std::sqrt(support.chance_count) + freedom;
     const double wanted = kExplainedShare * (count - std::min(accidents, kMaxAccidentalShare * count));
     const auto explained = std::count_if(distances.begin(), distances.end(), [&](double distance) {
         return distance < kExplainedThresholdFactor * threshold;

@@ -17,6 +17,8 @@ constexpr double kExplainedThresholdFactor = 2.0;
 // Keypoints are not better than this, and the median of absolute normal deviates times the second is their sigma.
 constexpr double kLeastNoisePx = 0.1;
 constexpr double kToSigma = 1.4826;
+// A translation may point anywhere: so many wrong matches agree with a rotation and the best of its directions.
+constexpr int kDirectionFreedom = 2;
 
 /// How well the fitted matches stand behind the model.
 struct Support {
@@ -46,11 +48,10 @@ cv::Matx33d fit_rotation(const Correspondences& matches, double threshold);
 /// @param rotation_px Sampson distances of what bears witness to the rotation's homography. epipolar_px: the same to E.
 bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<double>& epipolar_px);
 
-double median(std::vector<double> values);
-
 /// True where a degenerate model explains nearly all inliers, but for those that are there by accident.
 ///
 /// @param distances of the inliers to the degenerate model, or of more matches.
-bool explains(const std::vector<double>& distances, double threshold, const Support& support);
+/// @param freedom how many wrong matches the general model can be made to fit beside the right ones.
+bool explains(const std::vector<double>& distances, double threshold, const Support& support, int freedom = 0);
 
 }  // namespace mgca::detail

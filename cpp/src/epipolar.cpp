@@ -6,6 +6,15 @@
 
 namespace mgca::detail {
 
+Correspondences take(const Correspondences& matches, const std::vector<std::size_t>& positions) {
+    Correspondences taken;
+    taken.reserve(positions.size());
+    for (const std::size_t position : positions) {
+        taken.push_back(matches[position]);
+    }
+    return taken;
+}
+
 cv::Matx33d cross_matrix(const cv::Vec3d& t) { return {0.0, -t[2], t[1], t[2], 0.0, -t[0], -t[1], t[0], 0.0}; }
 
 cv::Matx33d essential_from_pose(const Pose& pose) {

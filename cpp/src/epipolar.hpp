@@ -5,6 +5,7 @@
 #include <opencv2/core.hpp>
 
 #include <array>
+#include <cstddef>
 #include <vector>
 
 namespace mgca::detail {
@@ -25,6 +26,9 @@ struct Pose {
 /// The viewing ray of a match in either image, in the coordinates of its camera.
 inline cv::Vec3d ray1(const Correspondence& match) { return {match[0], match[1], 1.0}; }
 inline cv::Vec3d ray2(const Correspondence& match) { return {match[2], match[3], 1.0}; }
+
+/// The matches at these positions.
+Correspondences take(const Correspondences& matches, const std::vector<std::size_t>& positions);
 
 /// Matrix of the cross product with t.
 cv::Matx33d cross_matrix(const cv::Vec3d& t);

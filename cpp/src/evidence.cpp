@@ -82,12 +82,7 @@ Evidence gather(const PairInput& pair, const Rows& ordered) {
 }  // namespace
 
 Correspondences Evidence::take(const Rows& positions) const {
-    Correspondences taken;
-    taken.reserve(positions.size());
-    for (const std::size_t position : positions) {
-        taken.push_back(correspondences[position]);
-    }
-    return taken;
+    return detail::take(correspondences, positions);
 }
 
 Correspondences Evidence::by_list_order() const {

@@ -2,6 +2,7 @@
 
 #include "degeneracy.hpp"
 #include "evidence.hpp"
+#include "statistics.hpp"
 
 #include <algorithm>
 #include <array>

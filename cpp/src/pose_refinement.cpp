@@ -180,15 +180,6 @@ std::vector<std::size_t> within(const Correspondences& matches, const Pose& pose
     return reached;
 }
 
-Correspondences take(const Correspondences& matches, const std::vector<std::size_t>& positions) {
-    Correspondences taken;
-    taken.reserve(positions.size());
-    for (const std::size_t position : positions) {
-        taken.push_back(matches[position]);
-    }
-    return taken;
-}
-
 /// Summed squared Sampson distances of matches to a pose with another direction of translation, the rotation moved from
 /// the pose's as that likes best, to first order.
 double cost_of_direction(const Correspondences& matches, const Pose& pose) {

@@ -1,6 +1,6 @@
 #include "robust_fit.hpp"
 
-#include "degeneracy.hpp"
+#include "statistics.hpp"
 #include "pose_refinement.hpp"
 
 #include <algorithm>

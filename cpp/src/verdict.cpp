@@ -5,6 +5,7 @@
 #include "homography.hpp"
 #include "homography_fit.hpp"
 #include "pose_refinement.hpp"
+#include "statistics.hpp"
 
 #include <algorithm>
 #include <numeric>
@@ -155,7 +156,7 @@ bool test_rotation(const PairInput& pair, const TwoViewModel& model, const Corre
     // Of a zoom both in pixels, whose noise is that of the keypoints in either image.
     const Correspondences pixels = in_pixels(pair, fitted);
     const std::vector<double> rotation_px = sampson_distances_to_homography(pixels, H);
-    if (!explains(rotation_px, kRefinePx, support)) {
+    if (!explains(rotation_px, kRefinePx, support, kDirectionFreedom)) {
         return false;
     }
     // All of them, for those that agree with the model are chosen by how little noise they have along one direction.

@@ -32,6 +32,8 @@ LOW_SUPPORT_LOG10_NFA = -1.0
 EXPLAINED_SHARE = 0.95
 EXPLAINED_THRESHOLD_FACTOR = 2.0
 MAX_ACCIDENTAL_SHARE = 0.3
+# A translation may point anywhere: so many wrong matches agree with a rotation and the best of its directions.
+DIRECTION_FREEDOM = 2
 # What explains less than this part of what is asked for is no near miss.
 CLEAR_SHORTFALL = 0.8
 INTRINSICS_SUPPORT_FACTOR = 1.5
@@ -157,15 +159,16 @@ def _unit(rays: Array) -> Array:
     return unit
 
 
-def explains(distance: Array, threshold: float, support: Support) -> bool:
+def explains(distance: Array, threshold: float, support: Support, freedom: int = 0) -> bool:
     """True where a degenerate model explains nearly all inliers, but for those that are there by accident.
 
     Args:
         distance: (N,) of the inliers to the degenerate model, or of more matches.
         threshold: inlier threshold, in the unit of ``distance``; twice as much is allowed.
         support: of the general model that the inliers agree with.
+        freedom: how many wrong matches the general model can be made to fit beside the right ones.
     """
-    wanted = _wanted(len(distance), support)
+    wanted = _wanted(len(distance), support, freedom)
     return bool(len(distance) and np.count_nonzero(distance < EXPLAINED_THRESHOLD_FACTOR * threshold) >= wanted)
 
 
@@ -179,10 +182,10 @@ def may_explain(distance: Array, threshold: float, support: Support) -> bool:
     return bool(explained >= CLEAR_SHORTFALL * _wanted(len(distance), support))
 
 
-def _wanted(count: int, support: Support) -> float:
+def _wanted(count: int, support: Support, freedom: int = 0) -> float:
     """How many of ``count`` matches a degenerate model must explain."""
     # Two standard deviations of a Poisson count: accidents do not come in their exact mean number.
-    accidents = support.chance_count + 2.0 * sqrt(support.chance_count)
+    accidents = support.chance_count + 2.0 * sqrt(support.chance_count) + freedom
     count = min(count, support.count)
     return EXPLAINED_SHARE * (count - min(accidents, MAX_ACCIDENTAL_SHARE * count))
 
@@ -223,4 +226,5 @@ def may_only_turn(correspondences: Array, threshold: float, support: Support) ->
     # what the rotation makes of the other, is within √2 d.
     tolerance = 2.0 * np.sqrt(2.0) * EXPLAINED_THRESHOLD_FACTOR * threshold
     alike = np.abs(sines[0] - sines[1]) <= tolerance
-    return bool(half - np.count_nonzero(alike) <= len(correspondences) - _wanted(len(correspondences), support))
+    wanted = _wanted(len(correspondences), support, DIRECTION_FREEDOM)
+    return bool(half - np.count_nonzero(alike) <= len(correspondences) - wanted)

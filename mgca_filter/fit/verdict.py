@@ -229,7 +229,7 @@ def _test_rotation(
     # Of a zoom both in pixels, whose noise is that of the keypoints in either image.
     rows = np.hstack(pair.pixels(fitted_rows))
     distance_px = sampson_distance_to_homography(rows, H)
-    if not degeneracy.explains(distance_px, REFINE_PX, support):
+    if not degeneracy.explains(distance_px, REFINE_PX, support, degeneracy.DIRECTION_FREEDOM):
         return None
     F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
     # All of them, for those that agree with the model are chosen by how little noise they have along one direction.
