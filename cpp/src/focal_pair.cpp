@@ -1,5 +1,6 @@
 #include "focal_pair.hpp"
 
+#include "least_squares.hpp"
 #include "pose_refinement.hpp"
 
 #include <algorithm>
@@ -88,7 +89,7 @@ TwoFocals FocalPairFit::refined(State state) const {
     double now = cost(distance, state.logs), damping = 1e-3;
     for (int round = 0; round < kMaxRounds; ++round) {
         const NormalEquations equations = normal_equations(state, distance);
-        const double previous = now;
+        const double previous = now, enough = kConvergedAt * std::max(previous, 1.0);
         for (; damping < kLargestDamping; damping *= 10.0) {
             cv::Matx<double, 7, 7> damped = equations.hessian;
             for (int k = 0; k < 7; ++k) {
@@ -96,6 +97,9 @@ TwoFocals FocalPairFit::refined(State state) const {
             }
             Step step = damped.solve(-equations.gradient, cv::DECOMP_LU);
             step *= std::min(1.0, kLargestStep / std::max(cv::norm(step, cv::NORM_INF), 1e-12));
+            if (!promises<7>(equations.hessian, equations.gradient, step, enough)) {
+                break;
+            }
             const State candidate = moved(state, step);
             const std::vector<double> candidate_distance = distances(candidate);
             const double candidate_cost = cost(candidate_distance, candidate.logs);
@@ -107,7 +111,7 @@ TwoFocals FocalPairFit::refined(State state) const {
                 break;
             }
         }
-        if (now > previous - kConvergedAt * std::max(previous, 1.0)) {
+        if (now > previous - enough) {
             break;
         }
     }

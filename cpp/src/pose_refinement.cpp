@@ -1,5 +1,7 @@
 #include "pose_refinement.hpp"
 
+#include "least_squares.hpp"
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -153,7 +155,11 @@ Pose minimise(const Correspondences& matches, Pose pose, const LossOf& loss, int
         }
         const double previous = cost;
         for (; damping < kMaxDamping; damping *= 10.0) {
-            const Pose candidate = apply_step(pose, equations.step(damping));
+            const Vec5d step = equations.step(damping);
+            if (!promises<5>(equations.hessian, equations.gradient, step, converged * cost)) {
+                return pose;
+            }
+            const Pose candidate = apply_step(pose, step);
             const double candidate_cost = cost_of(matches, candidate, loss);
             if (candidate_cost < cost) {
                 pose = candidate;
@@ -274,7 +280,7 @@ Pose refine_pose_by_weights(const Correspondences& matches, const Pose& start, c
     const double largest = *std::max_element(of_squares.begin(), of_squares.end());
     const auto cauchy = [&](std::size_t i, double squared) {
         const double relative = squared / (scale[reached[i]] * scale[reached[i]]);
-        return Loss{weights[reached[i]] * std::log1p(relative), of_squares[i] / (largest * (1.0 + relative))};
+        return Loss{weights[reached[i]] / largest * std::log1p(relative), of_squares[i] / (largest * (1.0 + relative))};
     };
     return minimise(take(matches, reached), start, cauchy, rounds, kFinelyConvergedDecrease);
 }

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.epipolar import cross_matrix, homogeneous_columns
+from ..geometry.least_squares import promises
 from ..geometry.pose_refinement import apply_step
 
 Array = NDArray[np.float64]
@@ -127,10 +128,13 @@ class FocalPairFit:
         for _ in range(_ROUNDS):
             hessian, gradient = self._normal_equations(R, t, logs, distance)
             previous = cost
+            enough = _CONVERGED_DECREASE * max(previous, 1.0)
             while damping < _MAX_DAMPING:
                 damped = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
                 step: Array = -np.asarray(np.linalg.solve(damped, gradient), dtype=np.float64)
                 step = step * min(1.0, _LARGEST_STEP / max(float(np.abs(step).max()), 1e-12))
+                if not promises(hessian, gradient, step, enough):
+                    break
                 moved = _moved(R, t, logs, step)
                 new_distance = self._distances(*moved)
                 new_cost = self._cost(new_distance, moved[2])
@@ -139,7 +143,7 @@ class FocalPairFit:
                     damping = max(0.1 * damping, _LEAST_DAMPING)
                     break
                 damping *= 10.0
-            if cost > previous - _CONVERGED_DECREASE * max(previous, 1.0):
+            if cost > previous - enough:
                 break
         hessian, _ = self._normal_equations(R, t, logs, distance)
         floor = 1e-9 + 1e-12 * float(np.trace(hessian))

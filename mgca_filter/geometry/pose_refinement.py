@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .epipolar import cross_matrix, homogeneous_columns
+from .least_squares import promises
 
 Array = NDArray[np.float64]
 # Cost of residuals (N,), and by how much each counts in the squares that stand for it near by, (N,).
@@ -75,11 +76,12 @@ def refine_pose_by_weights(
         return R, t
     scale, weights = scale[reached], weights[reached]
     of_squares = weights / scale**2
-    of_squares = of_squares / of_squares.max()
+    largest = of_squares.max()
+    of_costs, of_squares = weights / largest, of_squares / largest
 
     def cauchy(residual: Array) -> tuple[float, Array]:
         relative = (residual / scale) ** 2
-        return float((weights * np.log1p(relative)).sum()), of_squares / (1.0 + relative)
+        return float((of_costs * np.log1p(relative)).sum()), of_squares / (1.0 + relative)
 
     return _minimise(terms.take(reached), cauchy, rounds, _FINELY_CONVERGED_DECREASE)
 
@@ -99,6 +101,8 @@ def _minimise(start: SampsonTerms, loss: Loss, rounds: int, converged: float) ->
         previous = cost
         while damping < _MAX_DAMPING:
             step = -np.asarray(np.linalg.solve(hessian + damping * diagonal, gradient), dtype=np.float64)
+            if not promises(hessian, gradient, step, converged * cost):
+                return now.R, now.t
             new = now.moved(step)
             new_cost, new_weights = loss(new.residual)
             if new_cost < cost:
