@@ -42,6 +42,12 @@ std::vector<double> sampson_distances(const Correspondences& matches, const cv::
     return distances;
 }
 
+double parallax(const Correspondence& match, const cv::Matx33d& R) {
+    const cv::Vec3d x1 = ray1(match), x2 = ray2(match);
+    const double cosine = (R * x1).dot(x2);
+    return std::sqrt(std::max(1.0 - cosine * cosine / (x1.dot(x1) * x2.dot(x2)), 0.0));
+}
+
 cv::Matx33d project_to_essential(const cv::Matx33d& M) {
     cv::Matx33d U, Vt;
     cv::Matx31d values;

@@ -44,6 +44,9 @@ cv::Matx33d fundamental_from_essential(const cv::Matx33d& E, const cv::Matx33d& 
 double sampson_distance(const Correspondence& match, const cv::Matx33d& E);
 std::vector<double> sampson_distances(const Correspondences& matches, const cv::Matx33d& E);
 
+/// Sine of the angle between the viewing rays of a match, normalised, once the rotation is undone.
+double parallax(const Correspondence& match, const cv::Matx33d& R);
+
 /// Closest matrix with singular values (s, s, 0), scaled to unit Frobenius norm.
 cv::Matx33d project_to_essential(const cv::Matx33d& M);
 

@@ -269,20 +269,29 @@ std::optional<TwoViewModel> Search::refined(std::optional<TwoViewModel> model) c
         }
     }
     const Residuals residuals = measure_residuals(judged_, model->pose, evidence_.focal_px);
-    std::vector<double> inliers;
+    std::vector<double> distances, moves;  // of the inliers
     for (std::size_t i = 0; i < judged_.size(); ++i) {
         if (residuals.distance_px[i] < 1.0 && residuals.behind[i] == 0) {
-            inliers.push_back(residuals.distance_px[i]);
+            distances.push_back(residuals.distance_px[i]);
+            moves.push_back(parallax(judged_[i], model->pose.R));
         }
     }
-    const double half_px =
-        inliers.empty() ? kHalfWeightPx
-                        : std::clamp(kHalfWeightMedians * median(inliers), kLeastHalfWeightPx, kHalfWeightPx);
-    std::vector<double> scale;
-    for (const double noise : select(evidence_.noise, evidence_.once)) {
-        scale.push_back(half_px * noise / evidence_.focal_px);
+    if (distances.empty()) {
+        return model;
     }
-    model->pose = refine_pose_by_weights(judged_, model->pose, scale, weights, kLastReachPx / evidence_.focal_px);
+    const double half_px = std::clamp(kHalfWeightMedians * median(distances), kLeastHalfWeightPx, kHalfWeightPx);
+    const double farthest = kLargestParallaxMedians * median(moves);
+    const std::vector<double> noise = select(evidence_.noise, evidence_.once);
+    Correspondences still;
+    std::vector<double> scale, counted;
+    for (std::size_t i = 0; i < judged_.size(); ++i) {
+        if (parallax(judged_[i], model->pose.R) <= farthest) {
+            still.push_back(judged_[i]);
+            scale.push_back(half_px * noise[i] / evidence_.focal_px);
+            counted.push_back(weights[i]);
+        }
+    }
+    model->pose = refine_pose_by_weights(still, model->pose, scale, counted, kLastReachPx / evidence_.focal_px);
     model->M = model->E = essential_from_pose(model->pose);
     return model;
 }

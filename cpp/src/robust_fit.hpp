@@ -19,8 +19,10 @@ namespace mgca::detail {
 
 constexpr double kRefinePx = 1.0;
 // The last refinement: a match counts half at three times the median distance of the inliers, between these limits; none
-// counts beyond the reach.
+// counts beyond the reach, nor with so many times the inliers' median parallax: a wrong match of two images that hardly
+// differ is far from still, and the farther it moved, the longer is its lever.
 constexpr double kHalfWeightMedians = 3.0, kLeastHalfWeightPx = 1e-3, kHalfWeightPx = 0.5, kLastReachPx = 6.0;
+constexpr double kLargestParallaxMedians = 25.0;
 
 /// Model of a pair of images, on the normalised image planes.
 struct TwoViewModel {

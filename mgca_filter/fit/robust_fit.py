@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
+    parallax,
     project_to_essential,
     sampson_distance,
 )
@@ -32,8 +33,10 @@ Array = NDArray[np.float64]
 
 REFINE_PX = 1.0
 # The last refinement: a match counts half at three times the median distance of the inliers, between these limits; none
-# counts beyond the reach.
+# counts beyond the reach, nor with so many times the inliers' median parallax: a wrong match of two images that hardly
+# differ is far from still, and the farther it moved, the longer is its lever.
 HALF_WEIGHT_MEDIANS, LEAST_HALF_WEIGHT_PX, HALF_WEIGHT_PX, LAST_REACH_PX = 3.0, 1e-3, 0.5, 6.0
+LARGEST_PARALLAX_MEDIANS = 25.0
 # A hypothesis this close to a refined one would end there; one this close to the best is no twin of it.
 SAME_DEG, TWIN_DEG = 0.3, 2.0
 # The early end is given up where a run explains less than the first share of the list; above the second, one will do.
@@ -321,12 +324,18 @@ class Search:
             agreement = share**3 / (share**3 + (1.0 - share) ** 3)
             weights = 1.0 - (1.0 - evidence.scores[evidence.once]) * (1.0 - agreement)
         distance = model.judgement.distance_px
-        inliers = distance[distance < choice.INLIER_PX]
-        median = float(np.median(inliers)) if len(inliers) else HALF_WEIGHT_PX
-        half_px = min(max(HALF_WEIGHT_MEDIANS * median, LEAST_HALF_WEIGHT_PX), HALF_WEIGHT_PX)
+        inlier = distance < choice.INLIER_PX
+        if not inlier.any():
+            return model
+        half_px = HALF_WEIGHT_MEDIANS * float(np.median(distance[inlier]))
+        half_px = min(max(half_px, LEAST_HALF_WEIGHT_PX), HALF_WEIGHT_PX)
         pixel = 1.0 / evidence.focal_px
         scale = half_px * pixel * evidence.noise[evidence.once]
-        R, t = refine_pose_by_weights(self._judged, model.R, model.t, scale, weights, LAST_REACH_PX * pixel)
+        moved = parallax(self._judged, model.R)
+        still = moved <= LARGEST_PARALLAX_MEDIANS * float(np.median(moved[inlier]))
+        R, t = refine_pose_by_weights(
+            self._judged[still], model.R, model.t, scale[still], weights[still], LAST_REACH_PX * pixel
+        )
         E = essential_from_pose(R, t)
         return replace(model, M=E, E=E, R=R, t=t)
 

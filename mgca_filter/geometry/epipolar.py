@@ -97,6 +97,15 @@ def sampson_distance(
     return np.abs(error) / np.sqrt(np.maximum(n2 + n1, np.finfo(np.float64).tiny))
 
 
+def parallax(correspondences: FloatArray, R: FloatArray) -> FloatArray:
+    """Sine (N,) of the angle between the viewing rays of matches (N, 4), normalised, once the rotation is undone."""
+    x1, x2 = homogeneous_columns(correspondences[:, :2]), homogeneous_columns(correspondences[:, 2:])
+    # A rotation keeps the length of a ray.
+    lengths = np.einsum("in,in->n", x1, x1) * np.einsum("in,in->n", x2, x2)
+    cosine_squared = np.einsum("in,in->n", R @ x1, x2) ** 2 / lengths
+    return np.asarray(np.sqrt(np.maximum(1.0 - cosine_squared, 0.0)))
+
+
 def project_to_essential(M: ArrayLike) -> FloatArray:
     """Closest matrix with singular values (s, s, 0), scaled to unit Frobenius norm."""
     U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))

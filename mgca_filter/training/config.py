@@ -68,7 +68,8 @@ class ScheduleConfig:
         clip_norm: gradients are clipped to this norm.
         ema_decay: of the running average of the weights, which is what is evaluated and shipped.
         divergence_factor: the run stops when the averaged loss is this multiple of its lowest value; 0 = never.
-        precision: "bf16" runs matrix products in bfloat16; the solve and the graphs stay in float32.
+        precision: "bf16" runs matrix products in bfloat16; the solve and the graphs stay in float32. Processors that
+            have no bfloat16 of their own take twice as long with it as with "fp32".
     """
 
     kind: Literal["cosine", "steps"] = "cosine"
