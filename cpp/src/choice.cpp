@@ -254,7 +254,7 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
         const Residuals& residual = residuals.emplace_back(measure_residuals(matches, hypothesis.pose, focal_px));
         std::size_t near = 0;
         for (std::size_t i = 0; i < count; ++i) {
-            near += residual.distance_px[i] < 1.0 && residual.behind[i] == 0 ? 1 : 0;
+            near += residual.distance_px[i] < kInlierPx && residual.behind[i] == 0 ? 1 : 0;
         }
         inliers.push_back(near);
         most_inliers = std::max(most_inliers, near);
@@ -353,8 +353,8 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
             around += 1.0;
             weighted_around += weights[i];
         }
-        everything_near += distance < 1.0 ? 1 : 0;
-        weighted += distance < 1.0 && front ? weights[i] : 0.0;
+        everything_near += distance < kInlierPx ? 1 : 0;
+        weighted += distance < kInlierPx && front ? weights[i] : 0.0;
         near_two += distance < 2.0 && front ? counts[i] : 0.0;
         if (distance < 3.0 * kNoisePx * scale && front) {
             firm.push_back(matches[i]);

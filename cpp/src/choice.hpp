@@ -44,6 +44,9 @@ enum class Feature : std::size_t {
 };
 constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);
 
+// Matches within this distance are explained.
+constexpr double kInlierPx = 1.0;
+
 /// Coefficients by name, from the model file.
 struct Coefficients {
     std::vector<double> score_trust, noise_px, noise_weights, noise_scales, outlier_width_px, seen_behind, early_end,

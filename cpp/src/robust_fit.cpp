@@ -269,23 +269,24 @@ std::optional<TwoViewModel> Search::refined(std::optional<TwoViewModel> model) c
         }
     }
     const Residuals residuals = measure_residuals(judged_, model->pose, evidence_.focal_px);
-    std::vector<double> distances, moves;  // of the inliers
+    std::vector<double> moved, distances, moved_inliers;
     for (std::size_t i = 0; i < judged_.size(); ++i) {
-        if (residuals.distance_px[i] < 1.0 && residuals.behind[i] == 0) {
+        moved.push_back(parallax(judged_[i], model->pose.R));
+        if (residuals.distance_px[i] < kInlierPx && residuals.behind[i] == 0) {
             distances.push_back(residuals.distance_px[i]);
-            moves.push_back(parallax(judged_[i], model->pose.R));
+            moved_inliers.push_back(moved[i]);
         }
     }
     if (distances.empty()) {
         return model;
     }
     const double half_px = std::clamp(kHalfWeightMedians * median(distances), kLeastHalfWeightPx, kHalfWeightPx);
-    const double farthest = kLargestParallaxMedians * median(moves);
+    const double farthest = kLargestParallaxMedians * median(moved_inliers);
     const std::vector<double> noise = select(evidence_.noise, evidence_.once);
     Correspondences still;
     std::vector<double> scale, counted;
     for (std::size_t i = 0; i < judged_.size(); ++i) {
-        if (parallax(judged_[i], model->pose.R) <= farthest) {
+        if (moved[i] <= farthest) {
             still.push_back(judged_[i]);
             scale.push_back(half_px * noise[i] / evidence_.focal_px);
             counted.push_back(weights[i]);
