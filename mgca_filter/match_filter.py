@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from .inference.scoring import (
     INVALID_LOGIT,
     NetworkInput,
     NetworkOutput,
+    Opinion,
     assemble_logits,
     run_network,
     select_network_input,
@@ -51,6 +52,8 @@ PUBLISHED_MODELS = {"default": "mgca_small", "fast": "mgca_fast"}
 def model_path(name: str = "default") -> Path:
     """Where the ONNX file of a published model lies: ``"default"``, or ``"fast"``, a network of one stage.
 
+    The default filter asks the fast one first.
+
     Raises:
         ValueError: no model of this name is published.
     """
@@ -59,17 +62,22 @@ def model_path(name: str = "default") -> Path:
     return Path(__file__).resolve().parent / "models" / f"{PUBLISHED_MODELS[name]}.onnx"
 
 
-def find_model(model: str | Path | None) -> Path:
-    """The file that the option ``model`` means: a published model by its name, else a path; None = the default.
+def find_models(model: str | Path | None) -> tuple[Path, ...]:
+    """The files of the networks that the option ``model`` means, in the order in which they are asked.
+
+    None and ``"default"`` = a first look by the fast model, and the deep one where that does not settle a pair;
+    ``"fast"``, or a path = this one alone.
 
     Raises:
         TypeError: neither a name nor a path.
     """
-    if model is None or (isinstance(model, str) and model in PUBLISHED_MODELS):
-        return model_path(model or "default")
+    if model is None or model == "default":
+        return model_path("fast"), model_path("default")
+    if isinstance(model, str) and model in PUBLISHED_MODELS:
+        return (model_path(model),)
     if not isinstance(model, (str, Path)):
         raise TypeError(f"model: expected a path or a name, got {type(model).__name__}")
-    return Path(model)
+    return (Path(model),)
 
 
 class MatchFilter:
@@ -114,20 +122,21 @@ class MatchFilter:
             max_iterations=max_iterations,
             seed=seed,
         )
-        self._backend = shared_backend(find_model(model), backend, check_providers(providers))
+        asked = check_providers(providers)
+        self._backends = tuple(shared_backend(path, backend, asked) for path in find_models(model))
 
     @classmethod
-    def over(cls, backend: Backend, options: FilterOptions | None = None) -> MatchFilter:
-        """A filter over a backend that is open already, such as a network that is being trained."""
+    def over(cls, *backends: Backend, options: FilterOptions | None = None) -> MatchFilter:
+        """A filter over backends that are open already, the deepest last, such as a network that is being trained."""
         match_filter = cls.__new__(cls)
         match_filter.options = FilterOptions() if options is None else options
-        match_filter._backend = backend
+        match_filter._backends = backends
         return match_filter
 
     @property
     def metadata(self) -> ModelMetadata:
-        """What the model file says of itself."""
-        return self._backend.metadata
+        """What the model file says of itself; of several networks the deepest's."""
+        return self._backends[-1].metadata
 
     def filter(
         self,
@@ -152,7 +161,7 @@ class MatchFilter:
 
     @np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
     def filter_many(self, pairs: Iterable[MatchPair | tuple[Any, Any, Any]]) -> list[FilterResult]:
-        """Filter many pairs; those that send equally many matches go through the network in one batch.
+        """Filter many pairs; those that send equally many matches go through a network in one batch.
 
         Args:
             pairs: :class:`MatchPair` objects or tuples ``(kp1, kp2, matches)``.
@@ -164,17 +173,15 @@ class MatchFilter:
             As :func:`filter_matches`.
         """
         jobs = [self._start(pair, index) for index, pair in enumerate(pairs)]
-        by_count: dict[int, list[_Job]] = {}
-        for job in jobs:
-            if job.sent is not None and len(job.sent.rows):
-                by_count.setdefault(len(job.sent.rows), []).append(job)
-        for group in by_count.values():
-            for first in range(0, len(group), _BATCH_PAIRS):
-                self._run_batch(group[first : first + _BATCH_PAIRS])
+        for backend in self._backends:
+            waiting = [job for job in jobs if job.sent is not None]
+            self._ask(backend, waiting)
+            for job in waiting:
+                self._weigh(job, backend)
         return [self._finish(job) for job in jobs]
 
     def _start(self, pair: MatchPair | tuple[Any, Any, Any], index: int) -> _Job:
-        """Steps 1 and 2: read the pair; choose what enters the network."""
+        """Steps 1 and 2: read the pair; choose what enters the first network, if any."""
         started = time.perf_counter()
         if isinstance(pair, tuple) and len(pair) == 3:
             pair = MatchPair(*pair)
@@ -192,33 +199,56 @@ class MatchFilter:
         if self.options.method != "none":
             job.evidence = gather_before(prepared)
             if self.options.geometry != "homography":
-                job.search = Search(job.evidence, self._backend.metadata.choice, self.options)
+                job.search = Search(job.evidence, self.metadata.choice, self.options)
                 if self.options.method == "auto" and self.options.effort == "auto":
                     job.model = job.search.before_network()
             job.timings_ms["fit"] = _milliseconds_since(started)
         if job.model is None:
             job.sent = select_network_input(
-                prepared.correspondences, prepared.attributes, prepared.valid, self._backend, self.options.seed
+                prepared.correspondences, prepared.attributes, prepared.valid, self._backends[0], self.options.seed
             )
+            job.rows = job.sent.rows
         return job
 
-    def _run_batch(self, jobs: list[_Job]) -> None:
-        """Step 3: one forward pass."""
+    def _ask(self, backend: Backend, jobs: list[_Job]) -> None:
+        """Step 3: what a network says of the pairs that wait for it."""
+        by_count: dict[int, list[_Job]] = {}
+        for job in jobs:
+            if job.sent is not None and len(job.sent.rows):
+                by_count.setdefault(len(job.sent.rows), []).append(job)
+        for group in by_count.values():
+            for first in range(0, len(group), _BATCH_PAIRS):
+                self._run_batch(backend, group[first : first + _BATCH_PAIRS])
+
+    def _run_batch(self, backend: Backend, jobs: list[_Job]) -> None:
+        """One forward pass."""
         started = time.perf_counter()
-        outputs = run_network(self._backend, [job.sent for job in jobs if job.sent is not None])
+        outputs = run_network(backend, [job.sent for job in jobs if job.sent is not None])
         elapsed = _milliseconds_since(started) / len(jobs)
         for job, output in zip(jobs, outputs):
             job.output = output
-            job.timings_ms["network"] = elapsed
+            job.timings_ms["network"] = job.timings_ms.get("network", 0.0) + elapsed
+
+    def _weigh(self, job: _Job, backend: Backend) -> None:
+        """Steps 4 and 5: scores and robust fit; or what a deeper network shall see, where they settle nothing."""
+        pair, sent = job.pair, job.sent
+        assert sent is not None
+        job.asked.append(backend.metadata.name)
+        opinion = Opinion.of(assemble_logits(pair.attributes, pair.valid, sent, job.output, backend), backend.metadata)
+        job.opinion = opinion if job.opinion is None else job.opinion.joined(opinion, sent.rows)
+        last = backend is self._backends[-1]
+        if last or self.options.effort == "auto":
+            self._fit(job, last)
+        job.sent = None if last or job.model is not None else sent[job.opinion.undecided(sent.rows)]
 
     def _finish(self, job: _Job) -> FilterResult:
-        """Steps 4 to 7: scores, robust fit on the best of them, re-test of all matches, verdict."""
-        pair = job.pair
-        if job.model is None:
-            logits, scores = self._score(job)
-            self._fit(job, logits, scores)
-            pair = job.pair  # under another focal length now, where that was estimated
+        """Steps 6 and 7: re-test of all matches, verdict."""
+        pair = job.pair  # under another focal length now, where that was estimated
+        if job.opinion is not None:
+            logits = job.opinion.margins + np.float32(self.metadata.decision_threshold)
+            scores = self._scores(job)
         else:
+            assert job.model is not None
             logits, scores = self._score_by_residuals(pair, job.model)
         started = time.perf_counter()
         verdict = self._judge(job, scores)
@@ -242,7 +272,7 @@ class MatchFilter:
                 **self._describe(job),
                 "assumptions": [*self._assumptions(job), *self._remarks(verdict, scores)],
                 "logits": logits,
-                "num_accepted": int(np.count_nonzero(logits > self._backend.metadata.decision_threshold)),
+                "num_accepted": int(np.count_nonzero(logits > self.metadata.decision_threshold)),
                 **verdict.info,
             },
         )
@@ -252,7 +282,7 @@ class MatchFilter:
         pair, options = job.pair, self.options
         if job.evidence is None:
             return _verdict_by_scores(pair, self._keep_by_scores(pair, scores))
-        threshold_px, choice = pair.threshold_px(options.threshold), self._backend.metadata.choice
+        threshold_px, choice = pair.threshold_px(options.threshold), self.metadata.choice
         if options.geometry == "homography":
             verdict = judge_homography(pair, job.evidence, threshold_px, options)
         else:
@@ -280,7 +310,7 @@ class MatchFilter:
         confidence = confidence_under_estimate(job.model.confidence, sigma_deg)
         info = {**verdict.info, "focal_sigma_deg": sigma_deg, "fitted_confidence": job.model.confidence}
         job.model = replace(job.model, confidence=confidence)
-        _, usable = self._backend.metadata.choice["verdict"]
+        _, usable = self.metadata.choice["verdict"]
         if verdict.status is Status.OK and confidence < usable:
             return replace(verdict, status=Status.LOW_SUPPORT, info={**info, "focal_doubt": True})
         return replace(verdict, info=info)
@@ -304,22 +334,22 @@ class MatchFilter:
             _log.warning("%s", remarks[-1])
         return remarks
 
-    def _score(self, job: _Job) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Logits and scores (M,), (M,) of the network."""
-        pair, metadata = job.pair, self._backend.metadata
-        assert job.sent is not None
-        logits = assemble_logits(pair.attributes, pair.valid, job.sent, job.output, self._backend)
-        return logits, np.where(pair.valid, metadata.calibration.probabilities(logits), np.float32(0.0))
+    def _scores(self, job: _Job) -> NDArray[np.float32]:
+        """Scores (M,) by the networks that were asked."""
+        assert job.opinion is not None
+        return np.where(job.pair.valid, job.opinion.scores, np.float32(0.0))
 
-    def _fit(self, job: _Job, logits: NDArray[np.float32], scores: NDArray[np.float32]) -> None:
-        """The model on what the network saw."""
-        if job.evidence is None or job.sent is None:
+    def _fit(self, job: _Job, last: bool) -> None:
+        """The model on what the network saw; unless no deeper one is left, where that settles it alone."""
+        if job.evidence is None:
             return
+        assert job.opinion is not None
         started = time.perf_counter()
-        margins = logits - np.float32(self._backend.metadata.decision_threshold)
-        job.evidence = gather_scored(job.pair, job.sent.rows, scores, margins, job.network_essential)
+        scores, margins = self._scores(job), job.opinion.margins
+        evidence = gather_scored(job.pair, job.rows, scores, margins, job.network_essential)
         if job.search is not None:
-            job.model = job.search.with_network(job.evidence)
+            job.model = job.search.with_network(evidence) if last else job.search.after_first_look(evidence)
+        job.evidence = evidence
         if job.model is not None and not job.given and self.options.geometry == "auto":
             self._fit_under_estimated_focal(job, scores, margins)
         job.timings_ms["fit"] += _milliseconds_since(started)
@@ -328,13 +358,12 @@ class MatchFilter:
         """A second fit, of an essential matrix, where the matches tell the focal length that was guessed."""
         assert job.model is not None
         assert job.evidence is not None
-        assert job.sent is not None
         for estimate in estimate_focals(job.evidence, job.model.M):
             pair = job.pair.with_focals(*estimate.factors)
             zoom1, zoom2 = (np.diag([factor, factor, 1.0]) for factor in estimate.factors)
             E = None if job.network_essential is None else project_to_essential(zoom2 @ job.network_essential @ zoom1)
-            evidence = gather_scored(pair, job.sent.rows, scores, margins, E)
-            search = Search(gather_before(pair), self._backend.metadata.choice, self.options)
+            evidence = gather_scored(pair, job.rows, scores, margins, E)
+            search = Search(gather_before(pair), self.metadata.choice, self.options)
             model = search.with_network(evidence)
             if model is not None and agrees_as_well(evidence, model, job.evidence, job.model):
                 job.pair, job.evidence, job.model, job.focal = pair, evidence, model, estimate
@@ -344,7 +373,7 @@ class MatchFilter:
         self, pair: PairInput, model: TwoViewModel
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """The same (M,), (M,) of a pair that needed no network: how likely each residual is among right matches."""
-        metadata = self._backend.metadata
+        metadata = self.metadata
         scores = scores_by_residuals(pair, model, metadata.choice)
         return np.where(pair.valid, metadata.calibration.logits(scores), np.float32(INVALID_LOGIT)), scores
 
@@ -378,12 +407,13 @@ class MatchFilter:
         job.timings_ms["total"] = sum(job.timings_ms.values())
         return {
             "timings_ms": job.timings_ms,
-            "backend": self._backend.name,
-            "model": self._backend.metadata.name,
-            "model_sha256": self._backend.metadata.sha256,
+            "backend": self._backends[-1].name,
+            "model": " + ".join(backend.metadata.name for backend in self._backends),
+            "model_sha256": " + ".join(backend.metadata.sha256 for backend in self._backends),
+            "networks": job.asked,
             **self._describe_cameras(job),
-            "num_network_matches": 0 if job.sent is None else len(job.sent.rows),
-            "network_rows": np.zeros(0, dtype=np.intp) if job.sent is None else job.sent.rows,
+            "num_network_matches": len(job.rows),
+            "network_rows": job.rows,
             "network_essential": job.network_essential,
             "fitted_essential": None if job.model is None else job.model.E,
             "origin": None if job.model is None else job.model.origin,
@@ -401,8 +431,11 @@ class _Job:
     evidence: Evidence | None = None
     search: Search | None = None
     model: TwoViewModel | None = None
-    sent: NetworkInput | None = None
+    sent: NetworkInput | None = None  # to the network that is asked next
+    rows: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))  # sent to the first one
     output: NetworkOutput | None = None
+    opinion: Opinion | None = None
+    asked: list[str] = field(default_factory=list)
     focal: FocalEstimate | None = None
 
     @property
@@ -416,7 +449,7 @@ class _Job:
 
     @property
     def network_essential(self) -> NDArray[np.float32] | None:
-        """The network E (3, 3), where it was asked."""
+        """The network E (3, 3), where one was asked."""
         return None if self.output is None else self.output.essential
 
 
@@ -472,8 +505,8 @@ def filter_matches(
             ``"poselib"``, PoseLib's (needs that package) among them; ``"prosac"``, ``"magsac"``, ``"ransac"`` (or
             ``cv2.USAC_PROSAC``, ``cv2.USAC_MAGSAC``, ``cv2.RANSAC``), that one alone on what the network accepts; or
             ``"none"``, which returns scores and a mask of scores above 0.5 (or by ``keep_precision``), no geometry.
-        effort: ``"auto"`` leaves the network out where a run on the list alone explains it, and takes the scores from
-            the residuals; ``"full"`` always runs it.
+        effort: ``"auto"`` leaves the networks out where a run on the list alone explains it, and takes the scores from
+            the residuals; ``"full"`` always runs them all.
         geometry: ``"auto"``: an essential matrix where intrinsics are given, else a fundamental matrix, and a
             homography beside or instead of it where that explains the pair; ``"essential"`` demands the intrinsics;
             ``"fundamental"`` does not let them constrain the model; ``"homography"`` fits one and no more.
@@ -483,8 +516,9 @@ def filter_matches(
         resolution: pixels of the original per pixel of the image in which the keypoints were found: the factor by which
             coordinates that were found in a smaller copy were multiplied, the larger of the two images'. ``threshold``,
             and the pixels by which the fit judges, are then those of the copy.
-        model: ``"default"``, ``"fast"`` (a network of one stage, for video), or the path of a model file (``.onnx`` or
-            ``.safetensors``); None = the default.
+        model: ``"default"``: the fast network, and the deep one where that does not settle the pair; ``"fast"``: a
+            network of one stage alone, for video; or the path of a model file (``.onnx`` or ``.safetensors``), that one
+            alone. None = the default.
         providers: ONNX Runtime's execution providers; one that fails gives way to the CPU with one warning.
         backend: ``"auto"``, ``"onnxruntime"``, ``"opencv"`` (OpenCV 5) or ``"torch"``.
         seed: of every random choice; same seed, input and machine give the same bits.

@@ -179,13 +179,13 @@ def model_settings(model: str | None, options: dict[str, Any]) -> dict[str, Any]
     """
     import onnxruntime
 
-    from ..match_filter import MatchFilter, find_model
+    from ..match_filter import MatchFilter, find_models
 
     MatchFilter(model=model, **options)
-    path = find_model(model)
+    paths = find_models(model)
     return {
-        "model": path.name,
-        "model_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "model": " + ".join(path.name for path in paths),
+        "model_sha256": " + ".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths),
         "source_sha256": runtime_source_digest(),
         "opencv": cv2.__version__,
         "onnxruntime": onnxruntime.__version__,

@@ -1,7 +1,8 @@
 """The robust fit: what is proposed, refined, chosen, in this order.
 
 An easy pair ends before the network: a run or two on the list alone explain it, no other pose comes near, and its
-inliers hold it firmly. Otherwise unlike sources propose; where the first of them agree, the others are left out.
+inliers hold it firmly. Otherwise unlike sources propose, on the scores of a quick network; where the first of them agree,
+the deeper network and the other sources are left out.
 """
 
 from __future__ import annotations
@@ -59,9 +60,6 @@ SECOND = (
     BEFORE_NETWORK[1],
     Proposal("list order", Family.LIST_ORDERED, sources.listed, "prosac", 0.5, 1000, 0),
     Proposal("score order, all", Family.SCORE_ORDER, sources.above(-2.0), "prosac", 0.5, 1000, 3),
-    Proposal("score order, fine", Family.SCORE_ORDER, sources.above(-1.0), "prosac", 0.5, 1000, 1),
-    Proposal("score order, best", Family.SCORE_ORDER, sources.above(0.0), "prosac", 1.0, 1000, 2),
-    Proposal("accepted, more", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 1000, 3),
 )
 POSELIB = Proposal("PoseLib", Family.POSELIB, sources.listed, "poselib", 0.75, 10_000, 0)
 # One robust estimator alone, for those who ask for it.
@@ -169,6 +167,17 @@ class Search:
             return None
         same = self._twins_of is not None and _angle_deg(self._twins_of, self._best()) < TWIN_DEG
         return self._refined(replace(model, plane=self._plane) if same else model)
+
+    def after_first_look(self, evidence: Evidence) -> TwoViewModel | None:
+        """The model where the scores of a quick network settle it; None where a deeper one is wanted."""
+        if len(evidence) < MIN_MATCHES or not evidence.calibrated or self._options.method != "auto":
+            return None
+        self._take(evidence)
+        self._propose(self._plan.first)
+        if not self._settled():
+            return None
+        self._propose_twins()
+        return self._refined(self.current("first sources"))
 
     def with_network(self, evidence: Evidence) -> TwoViewModel | None:
         """The model by all sources, on scored matches; None where nothing is found."""

@@ -30,6 +30,10 @@ class Calibration:
     scale: float = 1.0
     offset: float = 0.0
 
+    def log_odds(self, logits: ArrayLike) -> NDArray[np.float32]:
+        """Logarithms (N,) float32 of the odds that a match is an inlier, from its logit (N,)."""
+        return (self.scale * np.asarray(logits, dtype=np.float64) + self.offset).astype(np.float32)
+
     def probabilities(self, logits: ArrayLike) -> NDArray[np.float32]:
         """Probability (N,) float32 that a match is an inlier, from its logit (N,)."""
         with np.errstate(under="ignore"):

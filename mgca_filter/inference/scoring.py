@@ -1,7 +1,8 @@
-"""Scores of all matches of a pair: who enters the network, and what the others get."""
+"""Scores of all matches of a pair: who enters a network, what the others get, and what several networks say together."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..inputs.attributes import candidate_mask
-from . import Backend
+from . import Backend, ModelMetadata
+from .calibration import sigmoid
 
 MAX_NETWORK_MATCHES = 8000
 # Logit of a match without usable coordinates: low enough for a probability of zero under any calibration.
 INVALID_LOGIT = -100.0
+# What scores less is no match for sure: a deeper network need not see it, unless there would be too few.
+HOPELESS_SCORE, FEWEST_UNDECIDED = 1e-3, 64
 # Rejected matches stay this far below the decision threshold, whatever the prior says; over the last part of the way
 # their logits are compressed, so that no two that the prior tells apart come out alike.
 _REJECTED_MARGIN = 1e-3
@@ -22,7 +26,7 @@ _COMPRESSED = 0.25
 
 @dataclass(frozen=True)
 class NetworkInput:
-    """What one pair sends through the network.
+    """What one pair sends through a network.
 
     Attributes:
         rows: (N,) rows of the pair's matches. correspondences: (N, 4) float32. attributes: (N, 8) float32.
@@ -32,6 +36,10 @@ class NetworkInput:
     correspondences: NDArray[np.float32]
     attributes: NDArray[np.float32]
 
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> NetworkInput:
+        """The part of it that a mask (N,) chooses."""
+        return NetworkInput(self.rows[chosen], self.correspondences[chosen], self.attributes[chosen])
+
 
 @dataclass(frozen=True)
 class NetworkOutput:
@@ -39,6 +47,46 @@ class NetworkOutput:
 
     logits: NDArray[np.float32]
     essential: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Opinion:
+    """What the networks that were asked say of the M matches of a pair, each as much as another.
+
+    Attributes:
+        margins: (M,) float32, logits above the decision threshold. log_odds: (M,) float32, calibrated.
+        networks: how many were asked.
+    """
+
+    margins: NDArray[np.float32]
+    log_odds: NDArray[np.float32]
+    networks: int = 1
+
+    @classmethod
+    def of(cls, logits: NDArray[np.float32], metadata: ModelMetadata) -> Opinion:
+        """What one network says, whose logits (M,) these are."""
+        return cls(logits - np.float32(metadata.decision_threshold), metadata.calibration.log_odds(logits))
+
+    @property
+    def scores(self) -> NDArray[np.float32]:
+        """Probabilities (M,) that the matches are right."""
+        return sigmoid(self.log_odds).astype(np.float32)
+
+    def joined(self, other: Opinion, rows: NDArray[np.intp]) -> Opinion:
+        """With what one more network says of the matches ``rows`` (N,) that it saw."""
+        networks = self.networks + other.networks
+        margins, log_odds = self.margins.copy(), self.log_odds.copy()
+        for mean, new in ((margins, other.margins), (log_odds, other.log_odds)):
+            mean[rows] += (new[rows] - mean[rows]) * np.float32(other.networks / networks)
+        return Opinion(margins, log_odds, networks)
+
+    def undecided(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """Those (N,) of the matches ``rows`` (N,) that a deeper network should see; a few, the best, in any case."""
+        log_odds = self.log_odds[rows]
+        undecided: NDArray[np.bool_] = log_odds > math.log(HOPELESS_SCORE / (1.0 - HOPELESS_SCORE))
+        if np.count_nonzero(undecided) < FEWEST_UNDECIDED:
+            undecided[np.argsort(-log_odds, kind="stable")[:FEWEST_UNDECIDED]] = True
+        return undecided
 
 
 def select_network_input(

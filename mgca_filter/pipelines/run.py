@@ -24,7 +24,7 @@ from .. import __version__
 from ..features import ImageFeatures
 from ..html_report.folder_report import PairLine, write_folder_report
 from ..inference.model_file import sha256_of
-from ..match_filter import MatchFilter, find_model
+from ..match_filter import MatchFilter, find_models
 from ..result import EXPLAINED
 from .journal import Journal, PipelineError, output_file
 from .worker import (
@@ -262,8 +262,8 @@ def run_identity(filter_options: dict[str, Any]) -> dict[str, Any]:
 
     The options of the filter, the content of its model and the version of this package: each of them changes rows.
     """
-    model = find_model(filter_options.get("model"))
-    return {**filter_options, "model_sha256": sha256_of(model), "version": __version__}
+    models = find_models(filter_options.get("model"))
+    return {**filter_options, "model_sha256": " + ".join(map(sha256_of, models)), "version": __version__}
 
 
 def run_pairs(source: PairSource, workers: Workers, journal: Journal, quiet: bool = False) -> Summary:
