@@ -173,11 +173,11 @@ class MatchFilter:
             As :func:`filter_matches`.
         """
         jobs = [self._start(pair, index) for index, pair in enumerate(pairs)]
-        for backend in self._backends:
+        for number, backend in enumerate(self._backends, 1):
             waiting = [job for job in jobs if job.sent is not None]
             self._ask(backend, waiting)
             for job in waiting:
-                self._weigh(job, backend)
+                self._weigh(job, backend, last=number == len(self._backends))
         return [self._finish(job) for job in jobs]
 
     def _start(self, pair: MatchPair | tuple[Any, Any, Any], index: int) -> _Job:
@@ -229,14 +229,13 @@ class MatchFilter:
             job.output = output
             job.timings_ms["network"] = job.timings_ms.get("network", 0.0) + elapsed
 
-    def _weigh(self, job: _Job, backend: Backend) -> None:
+    def _weigh(self, job: _Job, backend: Backend, last: bool) -> None:
         """Steps 4 and 5: scores and robust fit; or what a deeper network shall see, where they settle nothing."""
         pair, sent = job.pair, job.sent
         assert sent is not None
         job.asked.append(backend.metadata.name)
         opinion = Opinion.of(assemble_logits(pair.attributes, pair.valid, sent, job.output, backend), backend.metadata)
         job.opinion = opinion if job.opinion is None else job.opinion.joined(opinion, sent.rows)
-        last = backend is self._backends[-1]
         if last or self.options.effort == "auto":
             self._fit(job, last)
         job.sent = None if last or job.model is not None else sent[job.opinion.undecided(sent.rows)]

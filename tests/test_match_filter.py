@@ -445,14 +445,14 @@ EASY, HARD = make_scene(right=150, wrong=50), make_scene(right=60, wrong=240)
 @pytest.fixture
 def asked(match_filter: MatchFilter, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many matches each call sent to the network."""
-    backend, seen = match_filter._backend, []
+    (backend,), seen = match_filter._backends, []
     infer = backend.infer
     monkeypatch.setattr(backend, "infer", lambda *arrays: seen.append(arrays[0].shape[1]) or infer(*arrays))
     return seen
 
 
 def ask(match_filter: MatchFilter, scene: Scene, **options: object) -> FilterResult:
-    chosen = MatchFilter.over(match_filter._backend, replace(match_filter.options, **options))
+    chosen = MatchFilter.over(*match_filter._backends, options=replace(match_filter.options, **options))
     return chosen.filter(scene.points1, scene.points2, None, K1=K, attributes=scene.attributes)
 
 

@@ -30,12 +30,12 @@ from ..evaluation.metrics import FAILURE_DEG
 from ..features import create_detector, match_features
 from ..fit import choice
 from ..fit.choice import EARLY_FEATURES, FEATURES
-from ..fit.evidence import gather_before, gather_scored
+from ..fit.evidence import Evidence, gather_before, gather_scored
 from ..fit.robust_fit import PLAN, Search, TwoViewModel
 from ..geometry.epipolar import pose_error_deg
 from ..inference.model_file import SUMS_NAME, record_checksums
-from ..inputs.pair import MatchPair, prepare_pair
-from ..match_filter import MatchFilter, model_path
+from ..inputs.pair import MatchPair, PairInput, prepare_pair
+from ..match_filter import MatchFilter, find_models
 from .calibration_fit import expected_calibration_error
 from .pairs_apart import CROSS_RATIO, lists_of, parts_of_photographs, plausible_camera, rendered_apart
 
@@ -128,23 +128,35 @@ def apart_lists(folder: Path, count: int, seed: int) -> Iterator[tuple[str, Matc
 
 
 def samples_of(
-    pair: MatchPair, pose: tuple[Array, Array] | None, group: str, match_filter: MatchFilter
+    pair: MatchPair, pose: tuple[Array, Array] | None, group: str, filters: Sequence[MatchFilter]
 ) -> list[Sample]:
-    """What the search measures of its answer, before the network and with all sources."""
-    metadata = match_filter.metadata
+    """What the search measures of its answer, before the network, where it settles, and with all sources.
+
+    Args:
+        pair, pose, group: the list, its true pose, and the name that is kept out of one fold.
+        filters: of full effort, over the networks as they are asked: each over those before and one more.
+    """
     prepared = prepare_pair(pair)
-    result = match_filter.filter_many([pair])[0]
-    margins = result.info["logits"] - np.float32(metadata.decision_threshold)
-    network = (result.info["network_rows"], result.scores, margins, result.info["network_essential"])
+    *looks, last = (_scored(one, pair, prepared) for one in filters)
     found = []
     for plan in (PLAN, replace(PLAN, settle=False)):
-        search = Search(gather_before(prepared), metadata.choice, match_filter.options, plan)
+        search = Search(gather_before(prepared), filters[-1].metadata.choice, filters[-1].options, plan)
         if plan is PLAN:
             search.before_network()
             found.append(_sample(search.current(), pose, group, early=True))
-        model = search.with_network(gather_scored(prepared, *network))
+        settled = next((model for model in map(search.after_first_look, looks) if model is not None), None)
+        model = search.with_network(last) if settled is None else settled
         found.append(_sample(model, pose, group, early=False))
     return [sample for sample in found if sample is not None]
+
+
+def _scored(match_filter: MatchFilter, pair: MatchPair, prepared: PairInput) -> Evidence:
+    """The evidence that the networks of a filter leave."""
+    result = match_filter.filter_many([pair])[0]
+    margins = result.info["logits"] - np.float32(match_filter.metadata.decision_threshold)
+    return gather_scored(
+        prepared, result.info["network_rows"], result.scores, margins, result.info["network_essential"]
+    )
 
 
 def _sample(model: TwoViewModel | None, pose: tuple[Array, Array] | None, group: str, early: bool) -> Sample | None:
@@ -235,7 +247,7 @@ def describe_apart(p: Array, right: NDArray[np.bool_], apart: NDArray[np.bool_],
     )
 
 
-def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Sample]:
+def collect(options: argparse.Namespace, filters: Sequence[MatchFilter]) -> list[Sample]:
     """Samples of all lists."""
     sound = next((s for s in map(sound_scenes, options.bundles) if s is not None), None)
     samples: list[Sample] = []
@@ -251,12 +263,12 @@ def collect(options: argparse.Namespace, match_filter: MatchFilter) -> list[Samp
             for _, pair in kinds_of(raw):
                 cameras = (pair.K1, pair.K2, None, None, pair.image_size1, pair.image_size2)
                 matches = MatchPair(pair.points1, pair.points2, None, *cameras, pair.attributes)
-                samples += samples_of(matches, (pair.R, pair.t), scene, match_filter)
+                samples += samples_of(matches, (pair.R, pair.t), scene, filters)
     if options.photos is not None:
         for name, matches in unrelated_pairs(options.photos, options.unrelated, options.seed):
-            samples += samples_of(matches, None, f"unrelated {name}", match_filter)
+            samples += samples_of(matches, None, f"unrelated {name}", filters)
         for group, matches in apart_lists(options.photos, options.apart, options.seed):
-            samples += samples_of(matches, None, group, match_filter)
+            samples += samples_of(matches, None, group, filters)
     return samples
 
 
@@ -323,12 +335,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="photographs cut in two, and half as many rendered pairs, of one place without overlap (default 80)",
     )
     parser.add_argument("--exclude", nargs="*", default=[], metavar="SCENE", help="scenes of doubtful poses")
-    parser.add_argument("--model", type=Path, default=model_path(), help="whose scores are used")
+    parser.add_argument(
+        "--model",
+        type=Path,
+        metavar="FILE",
+        help="whose scores are used (default: the published ones, as they are asked)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
     parser.add_argument(
         "--samples", type=Path, metavar="FILE.npz", help="keep what was measured here, or take it from it"
     )
-    parser.add_argument("--write", action="store_true", help="put the coefficients into the model file as well")
+    parser.add_argument("--write", action="store_true", help="put the coefficients into the model files as well")
     options = parser.parse_args(arguments)
     coefficients = choice.fitted_coefficients()
     samples: list[Sample] = []
@@ -336,7 +353,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         samples = load_samples(options.samples)
     elif options.bundles:
         with one_thread():
-            samples = collect(options, MatchFilter(model=options.model, effort="full"))
+            models = ("fast", None) if options.model is None else (options.model,)
+            samples = collect(options, [MatchFilter(model=model, effort="full") for model in models])
         if options.samples is not None:
             save_samples(options.samples, samples)
     if samples:
@@ -356,7 +374,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         text = json.dumps(choice.check_coefficients(coefficients), indent=1)
         COEFFICIENTS_FILE.write_text(text + "\n", encoding="utf-8")
     if options.write:
-        write_into(options.model, coefficients)
+        for path in find_models(options.model):
+            write_into(path, coefficients)
     return 0
 
 

@@ -1,8 +1,8 @@
 """The robust fit: what is proposed, refined, chosen, in this order.
 
 An easy pair ends before the network: a run or two on the list alone explain it, no other pose comes near, and its
-inliers hold it firmly. Otherwise unlike sources propose, on the scores of a quick network; where the first of them agree,
-the deeper network and the other sources are left out.
+inliers hold it firmly. Otherwise unlike sources propose, on the scores of a quick network; where the first of them
+agree, the deeper network and the other sources are left out.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Scores of all matches of a pair: who enters a network, what the others get, and what several networks say together."""
+"""Scores of all matches of a pair: who enters a network, what the others get, what several networks say together."""
 
 from __future__ import annotations
 

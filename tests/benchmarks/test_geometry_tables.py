@@ -59,7 +59,7 @@ def test_made_up_pairs_obey_their_cameras(zoom: float) -> None:
 
 def test_a_row_without_intrinsics(match_filter: MatchFilter) -> None:
     pair = without_intrinsics.make_pair(4, 1.6)
-    free = MatchFilter.over(match_filter._backend, replace(match_filter.options, geometry="fundamental"))
+    free = MatchFilter.over(*match_filter._backends, options=replace(match_filter.options, geometry="fundamental"))
     outcomes = [without_intrinsics.run_pair(pair, 1.6, match_filter, free)]
     poses = without_intrinsics.pose_cells(1.6, outcomes)
     verdicts = without_intrinsics.verdict_cells(1.6, outcomes)

@@ -149,7 +149,7 @@ def test_samples_know_whether_they_are_right(model_file: Path) -> None:
     pair = MatchPair(scene.points1, scene.points2, None, K, attributes=scene.attributes)
     match_filter = MatchFilter(model=model_file, effort="full")
     for pose, right in (((scene.R, scene.t), True), ((scene.R.T, scene.t), False), (None, False)):
-        samples = choice_fit.samples_of(pair, pose, "hall", match_filter)
+        samples = choice_fit.samples_of(pair, pose, "hall", [match_filter])
         assert [sample.early for sample in samples] == [True, False, False]  # early, as it ends, with all sources
         assert {sample.right for sample in samples} == {right}
         assert [len(s.features) for s in samples] == [len(EARLY_FEATURES), len(FEATURES), len(FEATURES)]
@@ -188,12 +188,12 @@ def test_lists_without_overlap_are_all_wrong(tmp_path: Path, model_file: Path, m
     options = argparse.Namespace(
         bundles=[], exclude=[], per_scene=1, seed=0, photos=tmp_path, unrelated=0, apart=2, model=model_file
     )
-    samples = choice_fit.collect(options, MatchFilter(model=model_file, effort="full"))
+    samples = choice_fit.collect(options, [MatchFilter(model=model_file, effort="full")])
     assert {sample.group for sample in samples} <= set(groups)
     assert len(samples) > 6
     assert not any(sample.right for sample in samples)
     options.apart = 0
-    assert choice_fit.collect(options, MatchFilter(model=model_file, effort="full")) == []
+    assert choice_fit.collect(options, [MatchFilter(model=model_file, effort="full")]) == []
 
 
 def test_the_limit_for_pairs_without_overlap_is_told() -> None:
@@ -259,7 +259,9 @@ def test_the_command_fits_tells_and_writes(
 
     asked = []
     monkeypatch.setattr(
-        choice_fit, "collect", lambda options, f: asked.append(f.options) or [sample(i, i % 2 == 0) for i in range(600)]
+        choice_fit,
+        "collect",
+        lambda options, f: asked.append(f[0].options) or [sample(i, i % 2 == 0) for i in range(600)],
     )
     assert choice_fit.main([str(tmp_path), "--model", str(model), "--write"]) == 0
     assert asked[0].effort == "full"
@@ -284,5 +286,5 @@ def test_excluded_and_unsound_scenes_are_left_out(tmp_path: Path, model_file: Pa
     options = argparse.Namespace(
         bundles=[tmp_path], exclude=["roof"], per_scene=1, seed=0, photos=None, unrelated=0, apart=0, model=model_file
     )
-    samples = choice_fit.collect(options, MatchFilter(model=model_file, effort="full"))
+    samples = choice_fit.collect(options, [MatchFilter(model=model_file, effort="full")])
     assert {sample.group for sample in samples} == {"hall"}

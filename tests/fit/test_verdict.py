@@ -206,7 +206,7 @@ def test_the_status_follows_the_confidence_and_its_limits(monkeypatch: pytest.Mo
 def test_the_mask_is_the_distance_to_the_model(match_filter: MatchFilter) -> None:
     for threshold in (0.5, 3.0):
         scene = make_scene()
-        chosen = MatchFilter.over(match_filter._backend, FilterOptions(threshold=threshold))
+        chosen = MatchFilter.over(*match_filter._backends, options=FilterOptions(threshold=threshold))
         result = run(chosen, scene)
         pixels = np.hstack([scene.points1, scene.points2])
         np.testing.assert_array_equal(result.mask, sampson_distance(pixels, result.F) < threshold)

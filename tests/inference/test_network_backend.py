@@ -68,11 +68,13 @@ def test_a_network_without_prior_rejects_what_does_not_enter() -> None:
 def test_a_filter_over_a_backend_takes_options(both: tuple[Backend, Backend]) -> None:
     scene = make_scene()
     arguments = (scene.points1, scene.points2, None)
-    result = MatchFilter.over(both[0], FilterOptions(method="none")).filter(*arguments, attributes=scene.attributes)
+    result = MatchFilter.over(both[0], options=FilterOptions(method="none")).filter(
+        *arguments, attributes=scene.attributes
+    )
     assert result.E is None
     assert result.info["backend"] == "network"
     metadata = dataclasses.replace(both[0].metadata, calibration=Calibration(0.5, 1.0))
-    fitted = MatchFilter.over(NetworkBackend(tiny_network(seed=3), metadata), FilterOptions(method="none"))
+    fitted = MatchFilter.over(NetworkBackend(tiny_network(seed=3), metadata), options=FilterOptions(method="none"))
     scores = fitted.filter(*arguments, attributes=scene.attributes).scores
     np.testing.assert_array_equal(scores, metadata.calibration.probabilities(result.info["logits"]))
 
