@@ -36,7 +36,8 @@ class Calibration:
 
     def probabilities(self, logits: ArrayLike) -> NDArray[np.float32]:
         """Probability (N,) float32 that a match is an inlier, from its logit (N,)."""
-        return sigmoid(self.log_odds(logits)).astype(np.float32)
+        with np.errstate(under="ignore"):
+            return sigmoid(self.log_odds(logits)).astype(np.float32)
 
     def logits(self, probabilities: ArrayLike) -> NDArray[np.float32]:
         """The logits (N,) float32 that probabilities (N,) come from; 0 and 1 give those of 1e-9 below and above."""

@@ -70,7 +70,8 @@ class Opinion:
     @property
     def scores(self) -> NDArray[np.float32]:
         """Probabilities (M,) that the matches are right."""
-        return sigmoid(self.log_odds).astype(np.float32)
+        with np.errstate(under="ignore"):
+            return sigmoid(self.log_odds).astype(np.float32)
 
     def joined(self, other: Opinion, rows: NDArray[np.intp]) -> Opinion:
         """With what one more network says of the matches ``rows`` (N,) that it saw."""

@@ -40,7 +40,7 @@ def test_nothing_raises_where_numpy_is_told_to(match_filter: MatchFilter) -> Non
 
 @pytest.mark.parametrize("coordinate", [0.0, 1e-300, -1e-42, 999.0])
 def test_scoring_takes_any_usable_coordinates(match_filter: MatchFilter, coordinate: float) -> None:
-    backend = match_filter._backend
+    backend = match_filter._backends[0]
     correspondences, attributes = np.full((40, 4), coordinate), np.zeros((40, 8), np.float32)
     valid = np.arange(40) > 0
     with np.errstate(all="raise"):
