@@ -1,6 +1,6 @@
 """What each piece of the robust fit is worth: ``python -m benchmarks.fit_ablation BUNDLES``.
 
-The network scores every pair once; then the fit runs as users get it, and with one thing changed at a time. Each row
+The networks score every pair once; then the fit runs as users get it, and with one thing changed at a time. Each row
 has its difference to the fit as it is, on the same pairs and the same draws of the bootstrap. A second table tells
 where the answers came from, and how often each origin is right.
 """
@@ -24,7 +24,8 @@ from mgca_filter.evaluation.metrics import (
     mean_over_scenes,
     paired_bootstrap_interval,
 )
-from mgca_filter.fit.evidence import Evidence, gather_before, gather_scored
+from mgca_filter.export.choice_fit import scored_evidence
+from mgca_filter.fit.evidence import Evidence, gather_before
 from mgca_filter.fit.robust_fit import PLAN, POSELIB, Plan, Search, TwoViewModel
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.options import FilterOptions
@@ -50,11 +51,16 @@ def _without(*names: str) -> Plan:
 
 @dataclass(frozen=True)
 class Variant:
-    """A fit with one thing changed: the plan, the options, or whether it may end before the network."""
+    """A fit with one thing changed: the plan, the options, whether it may end before the network, or who is asked.
+
+    Attributes:
+        looks: which of the evidences behind the networks the fit is given, in turn, until one settles it; None = all.
+    """
 
     plan: Plan = PLAN
     options: FilterOptions = FilterOptions()
     early_end: bool = True
+    looks: tuple[int, ...] | None = None
 
 
 VARIANTS = {
@@ -62,12 +68,12 @@ VARIANTS = {
     "no end before the network": Variant(early_end=False),
     "all sources always": Variant(replace(PLAN, settle=False), early_end=False),
     "the first sources alone": Variant(replace(PLAN, second=())),
+    "both networks always": Variant(looks=(-1,)),
+    "the fast network alone": Variant(looks=(0,)),
     "without the network E": Variant(_without("network"), early_end=False),
     "without runs on the list": Variant(_without("list", "list, 1 px", "list order"), early_end=False),
-    "without runs on what is accepted": Variant(_without("accepted", "accepted, more"), early_end=False),
-    "without runs in the order of the scores": Variant(
-        _without("score order", "score order, all", "score order, fine", "score order, best"), early_end=False
-    ),
+    "without runs on what is accepted": Variant(_without("accepted"), early_end=False),
+    "without runs in the order of the scores": Variant(_without("score order", "score order, all"), early_end=False),
     "without the twin under the plane": Variant(replace(PLAN, twins=False)),
     "without the last refinement": Variant(replace(PLAN, last_refinement=False)),
     "PoseLib among the sources": Variant(replace(PLAN, second=(*PLAN.second, POSELIB))),
@@ -78,30 +84,29 @@ VARIANTS = {
 
 @dataclass(frozen=True)
 class ScoredPair:
-    """A pair behind the network: what the fit sees before and after it."""
+    """A pair behind the networks: what the fit sees before them, and after each."""
 
     pair: ScenePair
     before: Evidence
-    after: Evidence
+    after: tuple[Evidence, ...]
     coefficients: Mapping[str, Sequence[float]]
 
     @classmethod
-    def of(cls, pair: ScenePair, match_filter: MatchFilter) -> ScoredPair:
-        """Run the network once."""
-        metadata = match_filter.metadata
-        prepared = prepare_pair(match_pair(pair))
-        result = match_filter.filter_many([match_pair(pair)])[0]
-        logits = result.info["logits"]
-        margins = logits - np.float32(metadata.decision_threshold)
-        candidates = result.info["network_rows"]
-        after = gather_scored(prepared, candidates, result.scores, margins, result.info["network_essential"])
-        return cls(pair, gather_before(prepared), after, metadata.choice)
+    def of(cls, pair: ScenePair, filters: Sequence[MatchFilter]) -> ScoredPair:
+        """Run the networks once; ``filters`` are over the networks as they are asked."""
+        asked = match_pair(pair)
+        prepared = prepare_pair(asked)
+        after = tuple(scored_evidence(match_filter, asked, prepared) for match_filter in filters)
+        return cls(pair, gather_before(prepared), after, filters[-1].metadata.choice)
 
     def fit(self, variant: Variant) -> TwoViewModel | None:
         """The model that a variant finds."""
         search = Search(self.before, self.coefficients, variant.options, variant.plan)
+        *looks, last = self.after if variant.looks is None else [self.after[i] for i in variant.looks]
         model = search.before_network() if variant.early_end else None
-        return search.with_network(self.after) if model is None else model
+        for evidence in looks:
+            model = search.after_first_look(evidence) if model is None else model
+        return search.with_network(last) if model is None else model
 
     def error_deg(self, model: TwoViewModel | None) -> float:
         """Pose error, degrees; 180 without a model."""
@@ -146,7 +151,8 @@ def origin_table(models: Sequence[TwoViewModel | None], errors_deg: Sequence[flo
 
 def run(options: argparse.Namespace) -> int:
     """Print both tables."""
-    match_filter = MatchFilter(model=options.model, effort="full")
+    models_asked = ("fast", None) if options.model is None else (options.model,)
+    filters = [MatchFilter(model=model, effort="full") for model in models_asked]
     selections = drawn_pairs(options)
     errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in VARIANTS}
     ms: dict[str, list[float]] = {name: [] for name in VARIANTS}
@@ -154,7 +160,7 @@ def run(options: argparse.Namespace) -> int:
     first_errors: list[float] = []
     for selection in tqdm(selections, disable=None, unit=" scenes"):
         for index in selection.indices:
-            scored = ScoredPair.of(selection.source[index], match_filter)
+            scored = ScoredPair.of(selection.source[index], filters)
             for name, variant in VARIANTS.items():
                 per_seed = errors[name].setdefault(selection.source.scene, [[] for _ in options.seeds])
                 for row, seed in zip(per_seed, options.seeds):

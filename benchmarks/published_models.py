@@ -1,8 +1,8 @@
 """Is the fast model enough? ``python -m benchmarks.published_models FOLDER [FOLDER ...]``.
 
-The filter with each published model on the same lists, of every detector and kind, and what a forward pass costs on one
-thread, in turn. ``--fill`` puts the tables into the fast model's card. ``--candidate FILE`` asks the same of a model
-that is not published.
+The filter as it is, which asks both networks, and with either alone, on the same lists, of every detector and kind; and
+what a forward pass costs on one thread, in turn. ``--fill`` puts the tables into the fast model's card. ``--candidate
+FILE`` compares a model that is not published with the deep one, each alone.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,14 +32,21 @@ from .match_lists import KINDS, DetectorScene, ListKind, open_detector_scenes
 from .speed import network_input
 from .study import run_study, study_parser
 
-PLACE, REFERENCE, FAST = "published_models", "default", "fast"
+PLACE, DEEP, FAST = "published_models", "default", "fast"
+REFERENCE = "reference"
+STATISTICS_AND_DIFFERENCES = (" / ".join(STATISTICS), *(f"difference in {key}" for key in COMPARED))
 SIZES, REPEATS = (100, 500, 2000), 9
 
 
 def comparisons(
-    scenes: Sequence[DetectorScene], kinds: Sequence[ListKind], store: ResultStore, workers: int, candidate: Path
+    scenes: Sequence[DetectorScene],
+    kinds: Sequence[ListKind],
+    store: ResultStore,
+    workers: int,
+    candidate: Path,
+    reference: Path | None,
 ) -> dict[tuple[str, str], Comparison]:
-    """A model file against the default on the lists of each detector and kind."""
+    """A model file against another, None = the default filter, on the lists of each detector and kind."""
     found = {}
     for detector in dict.fromkeys(scene.detector for scene in scenes):
         for kind in kinds:
@@ -47,8 +55,8 @@ def comparisons(
             if not selections:
                 continue
             errors = {}
-            for name, model in ((OURS, candidate), (REFERENCE, model_path(REFERENCE))):
-                method = ProductMethod("product", model=str(model))
+            for name, model in ((OURS, candidate), (REFERENCE, reference)):
+                method = ProductMethod("product", model=None if model is None else str(model))
                 errors[name] = scene_errors(
                     predict([method], selections, store=store, seeds=1, workers=workers)[method.name]
                 )
@@ -57,25 +65,32 @@ def comparisons(
     return found
 
 
-def format_comparisons(found: dict[tuple[str, str], Comparison], candidate: str) -> str:
+def format_comparisons(found: dict[tuple[str, str], Comparison], candidate: str, reference: str) -> str:
     """A row a detector and kind of list, and their mean."""
     rows = []
     for (detector, kind), one in found.items():
         differences = [_difference(*one.against(REFERENCE, key)) for key in COMPARED]
-        figures = [" / ".join(f"{one.figures[name][key]:.1f}" for key in STATISTICS) for name in (REFERENCE, OURS)]
-        rows.append([detector, kind, str(one.lists), *figures, *differences])
-    means = [
-        " / ".join(f"{np.mean([one.figures[name][key] for one in found.values()]):.1f}" for key in STATISTICS)
-        for name in (REFERENCE, OURS)
-    ]
-    differences = []
+        rows.append(
+            [detector, kind, str(one.lists), *(_figures([one], name) for name in (REFERENCE, OURS)), *differences]
+        )
+    lists = str(sum(one.lists for one in found.values()))
+    rows.append(["mean", "", lists, _figures(list(found.values()), REFERENCE), *mean_cells(found)])
+    header = ["detector", "list", "lists", reference, candidate, *(f"difference in {key}" for key in COMPARED)]
+    return render_table(header, rows)
+
+
+def mean_cells(found: dict[tuple[str, str], Comparison]) -> list[str]:
+    """Figures of the candidate and its differences, means over detectors and kinds of list."""
+    cells = [_figures(list(found.values()), OURS)]
     for key in COMPARED:
         middle = float(np.mean([one.differences[REFERENCE][key] for one in found.values()]))
         draws = np.mean([one.resampled[REFERENCE][key] for one in found.values()], axis=0)
-        differences.append(_difference(middle, *percentile_interval(draws)))
-    rows.append(["mean", "", str(sum(one.lists for one in found.values())), *means, *differences])
-    header = ["detector", "list", "lists", "default", candidate, *(f"difference in {key}" for key in COMPARED)]
-    return render_table(header, rows)
+        cells.append(_difference(middle, *percentile_interval(draws)))
+    return cells
+
+
+def _figures(found: Sequence[Comparison], name: str) -> str:
+    return " / ".join(f"{np.mean([one.figures[name][key] for one in found]):.1f}" for key in STATISTICS)
 
 
 def _difference(middle: float, low: float, high: float) -> str:
@@ -99,8 +114,8 @@ def format_times() -> str:
     rows = []
     for count in SIZES:
         ms = network_ms(backends, count)
-        rows.append([str(count), *(f"{ms[name]:.1f}" for name in backends), f"{ms[FAST] / ms[REFERENCE]:.2f}"])
-    return render_table(["matches", *(f"{name}, ms" for name in backends), "ratio"], rows)
+        rows.append([str(count), *(f"{ms[name]:.1f}" for name in backends), f"{ms[FAST] / ms[DEEP]:.2f}"])
+    return render_table(["matches", *(f"{model_path(name).stem}, ms" for name in backends), "ratio"], rows)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -108,7 +123,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = study_parser("published_models", __doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("bundles", metavar="FOLDER", nargs="+", type=Path, help="folders of scene bundles, or bundles")
-    parser.add_argument("--candidate", type=Path, metavar="FILE", help="a model file in the place of the fast model")
+    parser.add_argument("--candidate", type=Path, metavar="FILE", help="a model file, against the deep model alone")
     parser.add_argument("--scenes", nargs="+", metavar="NAME", help="these alone")
     parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone, as the bundles' names have them")
     parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=list(KINDS), help="of lists (default: all)")
@@ -122,16 +137,22 @@ def run(options: argparse.Namespace) -> int:
     """Print both tables."""
     if options.fill and options.candidate:
         raise ValueError("--fill: the card is that of the fast model, not of --candidate")
-    candidate, name = options.candidate or model_path(FAST), options.candidate.stem if options.candidate else FAST
     scenes = open_detector_scenes(
         options.bundles, options.detectors, options.scenes, options.per_scene, options.seed, None
     )
     kinds = [KINDS[name] for name in dict.fromkeys(options.kinds)]
-    found = comparisons(scenes, kinds, ResultStore(options.store), options.workers, candidate)
+    compare = partial(comparisons, scenes, kinds, ResultStore(options.store), options.workers)
+    deep = model_path(DEEP)
+    candidate, reference = (options.candidate, deep) if options.candidate else (model_path(FAST), None)
+    found = compare(candidate, reference)
     if not found:
         raise DatasetError(f"{', '.join(map(str, options.bundles))}: no list of the kinds {', '.join(options.kinds)}")
-    table = format_comparisons(found, name)
-    tables = table if options.candidate else f"{table}\n\n{format_times()}"
+    tables = format_comparisons(found, f"{candidate.stem} alone", "default" if reference is None else deep.stem)
+    if reference is None:
+        alone = render_table(
+            ["", *STATISTICS_AND_DIFFERENCES], [[f"{deep.stem} alone", *mean_cells(compare(deep, None))]]
+        )
+        tables = f"{tables}\n\n{alone}\n\n{format_times()}"
     print(tables)
     if options.fill:
         fill_file(model_path(FAST).with_suffix(".md"), {PLACE: f"{tables}\n\n{provenance()}"})

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import cv2
 
-from mgca_filter import model_path
+from mgca_filter.match_filter import PUBLISHED_MODELS, model_path
 
 
 def provenance() -> str:
-    """Which model and library gave the figures."""
-    path = model_path()
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return f"`{path.name}` {digest[:12]}, OpenCV {cv2.__version__}."
+    """Which models and library gave the figures."""
+    files = [model_path(name) for name in PUBLISHED_MODELS]
+    digests = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    names = ", ".join(f"`{path.name}` {digest[:12]}" for path, digest in zip(files, digests))
+    return f"{names}, OpenCV {cv2.__version__}."
 
 
 def fill(page: str, name: str, content: str) -> str:

@@ -137,7 +137,7 @@ def samples_of(
         filters: of full effort, over the networks as they are asked: each over those before and one more.
     """
     prepared = prepare_pair(pair)
-    *looks, last = (_scored(one, pair, prepared) for one in filters)
+    *looks, last = (scored_evidence(one, pair, prepared) for one in filters)
     found = []
     for plan in (PLAN, replace(PLAN, settle=False)):
         search = Search(gather_before(prepared), filters[-1].metadata.choice, filters[-1].options, plan)
@@ -150,8 +150,8 @@ def samples_of(
     return [sample for sample in found if sample is not None]
 
 
-def _scored(match_filter: MatchFilter, pair: MatchPair, prepared: PairInput) -> Evidence:
-    """The evidence that the networks of a filter leave."""
+def scored_evidence(match_filter: MatchFilter, pair: MatchPair, prepared: PairInput) -> Evidence:
+    """What the fit knows of a pair when the networks of a filter of full effort have scored it."""
     result = match_filter.filter_many([pair])[0]
     margins = result.info["logits"] - np.float32(match_filter.metadata.decision_threshold)
     return gather_scored(

@@ -19,7 +19,7 @@ from mgca_filter.geometry.epipolar import pose_error_deg
 @pytest.fixture
 def scored(tmp_path: Path, model_file: Path) -> ScoredPair:
     write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
-    return ScoredPair.of(select_pairs(tmp_path)[0].source[0], MatchFilter(model=model_file, effort="full"))
+    return ScoredPair.of(select_pairs(tmp_path)[0].source[0], [MatchFilter(model=model_file, effort="full")])
 
 
 @pytest.mark.parametrize(("variant", "options"), [(AS_IT_IS, {}), ("no end before the network", {"effort": "full"})])
@@ -33,6 +33,21 @@ def test_the_fit_as_it_is_is_what_the_filter_does(
     np.testing.assert_array_equal(model.R, result.R)
     assert scored.error_deg(model) == pose_error_deg(result.R, result.t, pair.R, pair.t)
     assert model.ended == result.info["ended"]
+
+
+@pytest.mark.parametrize(("variant", "model"), [(AS_IT_IS, None), ("the fast network alone", "fast")])
+@pytest.mark.parametrize("right", [12, 40])
+def test_the_networks_are_asked_as_the_filter_asks_them(
+    tmp_path: Path, variant: str, model: str | None, right: int
+) -> None:
+    write_bundle(tmp_path / "hall.npz", [make_scene(right=right, wrong=300, seed=2)])
+    pair = select_pairs(tmp_path)[0].source[0]
+    scored = ScoredPair.of(pair, [MatchFilter(model=name, effort="full") for name in ("fast", None)])
+    result = filter_pair(pair, np.arange(len(pair.points1)), model, {})
+    found = scored.fit(VARIANTS[variant])
+    assert found is not None
+    np.testing.assert_array_equal(found.E, result.info["fitted_essential"])
+    assert found.ended == result.info["ended"]
 
 
 def test_every_variant_but_the_first_changes_something() -> None:
