@@ -63,12 +63,14 @@ class FilterResult:
             direction; None where there is no pose, or no intrinsics to trust.
         points1, points2: (M, 2) float64 pixels of every match, as they came in; NaN where a row holds no match.
         indices: (M, 2) rows of the keypoints, −1 where a row holds no match.
-        info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` (name), ``model_sha256``,
+        info: always ``logits`` (M,) float32, ``timings_ms`` by step, ``backend``, ``model`` and ``model_sha256`` (of
+            several networks in the order in which they are asked, " + " between them), ``networks`` (list of the names
+            of those that were asked; empty where the pair ended before),
             ``intrinsics`` ("given", "guessed", or "estimated" with ``focal_px``, the focal lengths of both images,
             equal unless the matches ask for two, and ``focal_sigma``, their relative standard deviations),
             ``assumptions`` (list of sentences), ``num_network_matches`` and
-            ``network_rows`` (those that entered the network), ``num_accepted`` (those above the decision threshold),
-            ``network_essential`` (3, 3) or None as the network gave it, ``fitted_essential`` (3, 3) or None as the
+            ``network_rows`` (those that entered the first network), ``num_accepted`` (those above the decision
+            threshold), ``network_essential`` (3, 3) or None as the last network gave it, ``fitted_essential`` (3, 3) or None as the
             robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it: "list",
             "network", "accepted", "score order", …, "plane"), and where the search ``ended`` ("before the network",
             where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:

@@ -89,7 +89,10 @@ def add_filter_options(
         "--geometry", choices=GEOMETRIES, default=FilterOptions.geometry, help="model that is fitted, default auto"
     )
     group.add_argument(
-        "--model", metavar="FILE", type=Path, help="default, fast, or a model file (.onnx, .safetensors)"
+        "--model",
+        metavar="FILE",
+        type=Path,
+        help="default (two networks), fast (one), or a model file (.onnx, .safetensors)",
     )
     add_providers_option(group)
     group.add_argument("--seed", type=int, default=0, help="of every random choice, default 0")

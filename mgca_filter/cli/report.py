@@ -225,6 +225,7 @@ def to_json(report: MatchReport) -> str:
         "backend": info.get("backend"),
         "model": info.get("model"),
         "model_sha256": info.get("model_sha256"),
+        "networks": list(info.get("networks", ())),
         "timings_ms": {
             name: _places(ms, 2)
             for name, ms in {**info["timings_ms"], "filter": report.filter_ms, "total": report.total_ms}.items()

@@ -398,7 +398,8 @@ def _facts(result: FilterResult, command: str) -> list[tuple[str, Any]]:
     info = result.info
     facts = [
         ("Model", " on ".join(str(info[key]) for key in ("model", "backend") if info.get(key))),
-        ("Model file", str(info.get("model_sha256", ""))[:16]),
+        ("Model file", " + ".join(digest[:16] for digest in str(info.get("model_sha256", "")).split(" + "))),
+        ("Networks asked", (" + ".join(info["networks"]) or "none") if "networks" in info else None),
         ("Intrinsics", info.get("intrinsics")),
         ("Origin of the fit", info.get("origin")),
         ("As good by chance", _power_of_ten(info.get("log10_false_alarms"))),

@@ -28,7 +28,7 @@ JSON_KEYS = {
     "version", "image1", "image2", "status", "confidence", "verified", "num_matches", "num_inliers",
     "E", "F", "R", "t", "H",
     "K1", "K2", "dist1", "dist2", "homography", "intrinsics", "focal_px", "assumptions", "backend", "model",
-    "model_sha256", "timings_ms", "kept",
+    "model_sha256", "networks", "timings_ms", "kept",
 }  # fmt: skip
 JUDGED = ("rotation_error_deg", "translation_error_deg", "num_inliers_right")
 
