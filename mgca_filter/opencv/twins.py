@@ -423,10 +423,21 @@ def _fit_essential(
     E = result.E if result.E is not None else result.info["fitted_essential"]
     if result.status is Status.PURE_ROTATION and result.R is not None:
         E = _essential_of_rotation(result.R)
+    elif (
+        result.status is not Status.OK and np.array_equal(K1, K2) and _stood_still(points1, points2, options.threshold)
+    ):
+        E = _essential_of_rotation(np.eye(3))
     if E is None:
         E = _find_by_opencv(_find_essential_mat, points1, points2, K1, None, K2, None)
         E = None if E is None else project_to_essential(E)  # OpenCV's own is one to a few digits only
     return E, _as_opencv_mask(result.mask, mask)
+
+
+def _stood_still(points1: Array, points2: Array, threshold: float) -> bool:
+    """Most points (N, 2) moved less than the threshold: neither did the camera."""
+    moved = np.linalg.norm(points2 - points1, axis=1)
+    moved = moved[np.isfinite(moved)]
+    return len(moved) > 0 and float(np.median(moved)) < threshold
 
 
 def _essential_of_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
