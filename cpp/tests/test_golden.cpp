@@ -1,6 +1,6 @@
 // The library gives the answers of Python on the golden pairs.
 //
-//     test_golden FOLDER MODEL [exact]
+//     test_golden FOLDER MODEL FIRST_LOOK [exact]
 //
 // Versions of OpenCV draw other samples; the choice and the refinement bring the answers together again: the intersection
 // over union of the masks is at least 0.98 and the pose within 0.1 degrees, where another seed does not change the answer
@@ -182,12 +182,12 @@ private:
 }  // namespace
 
 int main(int argc, char** argv) {
-    const bool exact = argc == 4 && std::string(argv[3]) == "exact";
-    if (argc != 3 && !exact) {
-        std::cerr << "usage: test_golden FOLDER MODEL [exact]\n";
+    const bool exact = argc == 5 && std::string(argv[4]) == "exact";
+    if (argc != 4 && !exact) {
+        std::cerr << "usage: test_golden FOLDER MODEL FIRST_LOOK [exact]\n";
         return 2;
     }
-    const mgca::Model model = mgca::Model::from_file(argv[2]);
+    const mgca::Model model = mgca::Model::from_file(argv[2]).with_first_look(mgca::Model::from_file(argv[3]));
     const std::vector<golden::Case> cases = golden::read_cases(argv[1]);
     check::that(cases.size() > 30, "several dozen cases");
     std::cout << mgca::Model::runtime() << ", OpenCV " << CV_VERSION << "\n";
