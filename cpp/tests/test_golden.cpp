@@ -66,6 +66,13 @@ private:
                      static_cast<int>(std::count(result_.mask.begin(), result_.mask.end(), 1)), name_ + ": num_inliers");
     }
 
+    /// Names of the networks that were asked, here and there.
+    bool same_networks() const {
+        const std::vector<Json>& expected = expected_["networks"].items();
+        return std::equal(result_.networks.begin(), result_.networks.end(), expected.begin(), expected.end(),
+                          [](const std::string& name, const Json& other) { return name == other.text(); });
+    }
+
     void scores() const {
         const std::vector<double> scores = expected_["scores"].numbers(), logits = expected_["logits"].numbers();
         const int sent = static_cast<int>(expected_["num_network_matches"].number());
@@ -81,10 +88,11 @@ private:
             worst_logit = std::max(worst_logit, std::abs(static_cast<double>(result_.logits[i]) - logits[i]));
         }
         if (exact_) {
+            check::that(same_networks(), name_ + ": networks");
             check::equal(result_.num_network_matches, sent, name_ + ": num_network_matches");
             check::near(worst, 0.0, 1e-3, name_ + ": scores");
             check::near(worst_logit, 0.0, sent > 0 ? 1e-3 : 2e-2, name_ + ": logits");
-        } else if ((result_.num_network_matches > 0) == (sent > 0)) {
+        } else if (same_networks()) {  // a network more, or the residuals, and the scores are others
             check::near(sum / static_cast<double>(scores.size()), 0.0, 0.03, name_ + ": mean difference of scores");
         }
     }
