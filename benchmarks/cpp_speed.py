@@ -123,7 +123,7 @@ class CppFilter:
         file = Path(self._folder.name) / "pairs.txt"
         write_pairs(file, pairs)
         self._process = subprocess.Popen(
-            [str(program), str(model_path()), str(file)],
+            [str(program), str(model_path()), str(model_path("fast")), str(file)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,

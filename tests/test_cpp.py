@@ -33,6 +33,8 @@ ROOT = Path(__file__).parent.parent
 SOURCE = ROOT / "cpp"
 PORT = SOURCE / "vcpkg" / "mgca"
 IMAGES = ROOT / "examples" / "images"
+# What the default filter asks, as the programs are given them: the deep network and the first look.
+MODELS = (mgca_filter.model_path(), mgca_filter.model_path("fast"))
 _BUILDS = tempfile.TemporaryDirectory(prefix="mgca_cpp_")
 # The compiler may take minutes on a busy machine.
 pytestmark = pytest.mark.timeout(1200)
@@ -101,10 +103,10 @@ def test_answers_are_those_of_python_on_this_machine(build, tmp_path):
     written = run(sys.executable, writer, "--expected-only", "--quick", "--out", tmp_path)
     assert written.returncode == 0, written.stderr
     tests = program(build, "test_golden")
-    done = run(tests, tmp_path, mgca_filter.model_path())
+    done = run(tests, tmp_path, *MODELS)
     assert done.returncode == 0, done.stdout + done.stderr
     if f"OpenCV {cv2.__version__}\n" in done.stdout:
-        done = run(tests, tmp_path, mgca_filter.model_path(), "exact")
+        done = run(tests, tmp_path, *MODELS, "exact")
         assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -166,10 +168,15 @@ def camera() -> str:
 @pytest.mark.slow
 def test_tool_answers_in_words_and_json(build):
     tool = program(build, "mgca_match")
-    images = (IMAGES / "left.jpg", IMAGES / "right.jpg", "--model", mgca_filter.model_path())
-    done = run(tool, *images, "--K", camera())
+    views = (IMAGES / "left.jpg", IMAGES / "right.jpg")
+    done = run(tool, *views, "--K", camera())
     assert done.returncode == 0, done.stderr
     assert re.search(r"status +ok\n", done.stdout)
+    images = (*views, "--model", MODELS[0])
+    files = ((), ("--model", MODELS[0], "--first-look", MODELS[1]), images[2:])
+    within, both, alone = (run(tool, *views, *words, "--effort", "full", "--json").stdout for words in files)
+    assert json.loads(within) == json.loads(both)
+    assert json.loads(both)["scores"] != json.loads(alone)["scores"]
     done = run(tool, *images, "--K", camera(), "--json", "--method", "magsac", "--seed", "3", "--threads", "2")
     answer = json.loads(done.stdout)
     assert done.returncode == 0
@@ -190,6 +197,8 @@ def test_tool_answers_in_words_and_json(build):
         (["a.png", "b.png", "--model", "m.onnx", "--method", "best"], "method: expected one of auto, prosac"),
         (["a.png", "b.png", "--model", "m.onnx", "--seed", "1.5"], "--seed: expected an integer"),
         (["a.png", "b.png", "--model", "m.onnx"], "m.onnx: model file not found"),
+        (["a.png", "b.png", "--model", str(MODELS[0]), "--first-look", "m.onnx"], "m.onnx: model file not found"),
+        (["a.png", "b.png", "--first-look", str(MODELS[1])], "--first-look: needs --model"),
         (["a.png", "b.png", "--model", str(mgca_filter.model_path())], "a.png: not a readable image"),
         (["a.png", "b.png", "--model", str(mgca_filter.model_path()), "--threshold", "0"], "threshold: expected"),
     ],
@@ -212,7 +221,7 @@ def test_odometry_times_every_frame(build, image_folder, tmp_path):
         done = run(*command)
         assert done.returncode == 0, done.stdout + done.stderr
     for source in ("orb", "flow"):
-        done = run(program(examples, "odometry"), image_folder, "800,800,319.5,239.5", source, mgca_filter.model_path())
+        done = run(program(examples, "odometry"), image_folder, "800,800,319.5,239.5", source, *MODELS)
         assert done.returncode == 0, done.stderr
         assert re.search(r"3 pairs: .* filter [\d.]+ ms per frame", done.stdout)
         assert len(re.findall(r"(?m)^\S+  [a-z_]+  \d+ of \d+  features", done.stdout)) == 3
@@ -258,5 +267,19 @@ def test_opencv_4_alone_is_refused(build, tmp_path):
         assert "cannot run the model" in re.sub(r"\s+", " ", done.stderr)
 
 
-def golden_arguments() -> tuple[Path, Path]:
-    return ROOT / "tests" / "golden", mgca_filter.model_path()
+def test_models_to_embed_are_checked(build, tmp_path):
+    shutil.copytree(MODELS[0].parent, tmp_path / "models", ignore=shutil.ignore_patterns("*.safetensors"))
+    with open(tmp_path / "models" / "mgca_fast.onnx", "ab") as file:
+        file.write(b"more")
+    for option in ("MGCA_MODEL_FILE", "MGCA_FIRST_LOOK_FILE"):
+        for name, message in (("mgca_fast.onnx", "damaged or replaced"), ("no.onnx", f"-D{option}=... names")):
+            path = tmp_path / "models" / name
+            done = run("cmake", "-S", SOURCE, "-B", tmp_path / option, f"-D{option}={path}")
+            words = re.sub(r"\s+", "", done.stderr)
+            assert done.returncode != 0
+            assert f"{path}is" in words
+            assert message.replace(" ", "") in words
+
+
+def golden_arguments() -> tuple[Path, Path, Path]:
+    return ROOT / "tests" / "golden", *MODELS

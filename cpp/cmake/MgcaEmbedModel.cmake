@@ -1,30 +1,46 @@
-# The model within the library, for mgca::embedded_model(): MGCA_EMBED_MODEL, MGCA_MODEL_FILE.
+# The models within the library, for mgca::embedded_model(): MGCA_EMBED_MODEL, MGCA_MODEL_FILE, MGCA_FIRST_LOOK_FILE.
 
 set(MGCA_MODEL_FILE "${CMAKE_CURRENT_SOURCE_DIR}/../mgca_filter/models/mgca_small.onnx" CACHE FILEPATH
   "Model file that MGCA_EMBED_MODEL puts into the library")
+set(MGCA_FIRST_LOOK_FILE "${CMAKE_CURRENT_SOURCE_DIR}/../mgca_filter/models/mgca_fast.onnx" CACHE FILEPATH
+  "Model file of a quicker network that is asked before it, likewise; empty = none")
 if(NOT MGCA_EMBED_MODEL)
   return()
 endif()
 
-if(NOT EXISTS "${MGCA_MODEL_FILE}")
-  message(FATAL_ERROR "MGCA_EMBED_MODEL: ${MGCA_MODEL_FILE} is not there; -DMGCA_MODEL_FILE=... names a model file")
-endif()
-get_filename_component(MGCA_MODEL_PATH "${MGCA_MODEL_FILE}" REALPATH)
+# The real path of a model file that is there, is the one that the sums beside the shipped models list (a user's own model
+# is not listed), and is read again when it changes.
+function(mgca_check_model option path)
+  set(file "${${option}}")
+  if(NOT EXISTS "${file}")
+    message(FATAL_ERROR "MGCA_EMBED_MODEL: ${file} is not there; -D${option}=... names a model file")
+  endif()
+  get_filename_component(real "${file}" REALPATH)
+  get_filename_component(folder "${file}" DIRECTORY)
+  get_filename_component(name "${file}" NAME)
+  if(EXISTS "${folder}/SHA256SUMS")
+    file(STRINGS "${folder}/SHA256SUMS" sums)
+    file(SHA256 "${real}" digest)
+    foreach(line IN LISTS sums)
+      if(line MATCHES "^([0-9a-f]+)  (.*)$" AND CMAKE_MATCH_2 STREQUAL name AND NOT CMAKE_MATCH_1 STREQUAL digest)
+        message(FATAL_ERROR
+          "MGCA_EMBED_MODEL: ${file} is damaged or replaced, its SHA-256 is not the one in SHA256SUMS")
+      endif()
+    endforeach()
+    set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS "${folder}/SHA256SUMS" "${real}")
+  endif()
+  set(${path} "${real}" PARENT_SCOPE)
+endfunction()
 
-# The sums beside the shipped models; a user's own model is not listed.
-get_filename_component(MGCA_MODEL_FOLDER "${MGCA_MODEL_FILE}" DIRECTORY)
-get_filename_component(MGCA_MODEL_NAME "${MGCA_MODEL_FILE}" NAME)
-if(EXISTS "${MGCA_MODEL_FOLDER}/SHA256SUMS")
-  file(STRINGS "${MGCA_MODEL_FOLDER}/SHA256SUMS" MGCA_MODEL_SUMS)
-  file(SHA256 "${MGCA_MODEL_PATH}" MGCA_MODEL_SHA256)
-  foreach(line IN LISTS MGCA_MODEL_SUMS)
-    if(line MATCHES "^([0-9a-f]+)  (.*)$" AND CMAKE_MATCH_2 STREQUAL MGCA_MODEL_NAME
-        AND NOT CMAKE_MATCH_1 STREQUAL MGCA_MODEL_SHA256)
-      message(FATAL_ERROR
-        "MGCA_EMBED_MODEL: ${MGCA_MODEL_FILE} is damaged or replaced, its SHA-256 is not the one in SHA256SUMS")
-    endif()
-  endforeach()
-  set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS "${MGCA_MODEL_FOLDER}/SHA256SUMS" "${MGCA_MODEL_PATH}")
+mgca_check_model(MGCA_MODEL_FILE MGCA_MODEL_PATH)
+set(MGCA_EMBEDDED_PATHS "${MGCA_MODEL_PATH}")
+set(MGCA_EMBEDDED_DEFINITIONS "MGCA_EMBEDDED_FILE=\"${MGCA_MODEL_PATH}\"")
+if(MGCA_FIRST_LOOK_FILE)
+  mgca_check_model(MGCA_FIRST_LOOK_FILE MGCA_FIRST_LOOK_PATH)
+  if(NOT MGCA_FIRST_LOOK_PATH STREQUAL MGCA_MODEL_PATH)  # else the quick one is all that is wanted
+    list(APPEND MGCA_EMBEDDED_PATHS "${MGCA_FIRST_LOOK_PATH}")
+    list(APPEND MGCA_EMBEDDED_DEFINITIONS "MGCA_EMBEDDED_FIRST_LOOK_FILE=\"${MGCA_FIRST_LOOK_PATH}\"")
+  endif()
 endif()
 
 # g++ and clang hand such a line to an assembler that knows .incbin; Microsoft's compiler has none.
@@ -40,6 +56,6 @@ if(NOT MGCA_HAS_INCBIN)
 endif()
 # Without link-time optimisation, which would read the file when a user's program is linked.
 set_source_files_properties(src/embedded_model.cpp PROPERTIES
-  COMPILE_DEFINITIONS "MGCA_EMBEDDED_FILE=\"${MGCA_MODEL_PATH}\""
+  COMPILE_DEFINITIONS "${MGCA_EMBEDDED_DEFINITIONS}"
   COMPILE_OPTIONS -fno-lto
-  OBJECT_DEPENDS "${MGCA_MODEL_PATH}")
+  OBJECT_DEPENDS "${MGCA_EMBEDDED_PATHS}")

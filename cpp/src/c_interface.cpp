@@ -199,6 +199,12 @@ int mgca_model_open_memory(const void* data, size_t size, int threads, const cha
     });
 }
 
+int mgca_model_with_first_look(const mgca_model* model, const mgca_model* first_look, mgca_model** both) {
+    return created(both, "both", [&] {
+        return new mgca_model{at(model, "model").model.with_first_look(at(first_look, "first_look").model)};
+    });
+}
+
 const char* mgca_model_name(const mgca_model* model) { return model == nullptr ? "" : model->model.name().c_str(); }
 
 const char* mgca_model_version(const mgca_model* model) {
@@ -459,6 +465,12 @@ const char* mgca_result_word(const mgca_result* result, const char* name) {
             unknown("name", word);
         }
         return word == "origin" ? known.origin.c_str() : known.ended.c_str();
+    });
+}
+
+const char* mgca_result_network(const mgca_result* result, size_t index) {
+    return value_of<const char*>(result, nullptr, [&](const mgca::Result& known) {
+        return index < known.networks.size() ? known.networks[index].c_str() : nullptr;
     });
 }
 

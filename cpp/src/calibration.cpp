@@ -23,10 +23,13 @@ double gelu(double x) {
 
 }  // namespace
 
-float Calibration::probability(float logit) const {
-    const double x = scale * static_cast<double>(logit) + offset;
-    const double e = std::exp(-std::abs(x));
-    return static_cast<float>((x >= 0.0 ? 1.0 : e) / (1.0 + e));
+float sigmoid(float x) {
+    const double e = std::exp(-std::abs(static_cast<double>(x)));
+    return static_cast<float>((x >= 0.0F ? 1.0 : e) / (1.0 + e));
+}
+
+float Calibration::log_odds(float logit) const {
+    return static_cast<float>(scale * static_cast<double>(logit) + offset);
 }
 
 float Calibration::logit(float probability) const {

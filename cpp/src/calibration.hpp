@@ -10,11 +10,17 @@
 
 namespace mgca::detail {
 
+/// 1 / (1 + exp(-x)) without overflow.
+float sigmoid(float x);
+
 /// Platt scaling: probability = sigmoid(scale * logit + offset).
 struct Calibration {
     double scale = 1.0, offset = 0.0;
 
-    float probability(float logit) const;
+    /// Logarithm of the odds that a match is an inlier.
+    float log_odds(float logit) const;
+
+    float probability(float logit) const { return sigmoid(log_odds(logit)); }
 
     /// The logit that a probability comes from; 0 and 1 give those of 1e-9 below and above.
     float logit(float probability) const;

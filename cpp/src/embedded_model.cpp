@@ -1,4 +1,4 @@
-// The model file within the library: cmake/MgcaEmbedModel.cmake. The assembler copies its bytes, which takes no time.
+// The model files within the library: cmake/MgcaEmbedModel.cmake. The assembler copies their bytes, which takes no time.
 
 #include "embedded_model.hpp"
 
@@ -27,42 +27,49 @@
 
 #define MGCA_GLOBAL(name) ".globl " MGCA_SYMBOL(name) "\n" MGCA_HIDDEN(name)
 
-// Global within the library, so that link-time optimisation finds them from another unit.
-__asm__(MGCA_READ_ONLY
-        MGCA_GLOBAL("mgca_embedded_model_begin")
-        MGCA_GLOBAL("mgca_embedded_model_end")
-        ".balign 64\n"
-        MGCA_SYMBOL("mgca_embedded_model_begin") ":\n"
-        ".incbin \"" MGCA_EMBEDDED_FILE "\"\n"
-        MGCA_SYMBOL("mgca_embedded_model_end") ":\n"
-        ".byte 0\n"
-        MGCA_BACK);
-
 #if defined(__GNUC__) && !defined(_WIN32)
 #define MGCA_LOCAL __attribute__((visibility("hidden")))
 #else
 #define MGCA_LOCAL
 #endif
-extern "C" {
-extern const char mgca_embedded_model_begin[] MGCA_LOCAL;
-extern const char mgca_embedded_model_end[] MGCA_LOCAL;
-}
+
+// Global within the library, so that link-time optimisation finds them from another unit.
+#define MGCA_EMBED(name, file)                              \
+    __asm__(MGCA_READ_ONLY                                  \
+            MGCA_GLOBAL(#name "_begin")                     \
+            MGCA_GLOBAL(#name "_end")                       \
+            ".balign 64\n"                                  \
+            MGCA_SYMBOL(#name "_begin") ":\n"               \
+            ".incbin \"" file "\"\n"                        \
+            MGCA_SYMBOL(#name "_end") ":\n"                 \
+            ".byte 0\n"                                     \
+            MGCA_BACK);                                     \
+    extern "C" const char name##_begin[] MGCA_LOCAL;        \
+    extern "C" const char name##_end[] MGCA_LOCAL;          \
+    static std::string_view name() { return {name##_begin, static_cast<std::size_t>(name##_end - name##_begin)}; }
+
+MGCA_EMBED(mgca_embedded_model, MGCA_EMBEDDED_FILE)
+#ifdef MGCA_EMBEDDED_FIRST_LOOK_FILE
+MGCA_EMBED(mgca_embedded_first_look, MGCA_EMBEDDED_FIRST_LOOK_FILE)
+#endif
+#endif
 
 namespace mgca::detail {
 
 std::string_view embedded_model() {
-    return {mgca_embedded_model_begin,
-            static_cast<std::size_t>(mgca_embedded_model_end - mgca_embedded_model_begin)};
+#ifdef MGCA_EMBEDDED_FILE
+    return mgca_embedded_model();
+#else
+    return {};
+#endif
+}
+
+std::string_view embedded_first_look() {
+#if defined(MGCA_EMBEDDED_FILE) && defined(MGCA_EMBEDDED_FIRST_LOOK_FILE)
+    return mgca_embedded_first_look();
+#else
+    return {};
+#endif
 }
 
 }  // namespace mgca::detail
-
-#else
-
-namespace mgca::detail {
-
-std::string_view embedded_model() { return {}; }
-
-}  // namespace mgca::detail
-
-#endif

@@ -1,4 +1,4 @@
-// The model file within the library.
+// The model files within the library.
 
 #pragma once
 
@@ -6,7 +6,10 @@
 
 namespace mgca::detail {
 
-/// Its bytes; empty where the library was built without one.
+/// Bytes of the model; empty where the library was built without one.
 std::string_view embedded_model();
+
+/// Bytes of the model that is asked first; empty where the library was built without one.
+std::string_view embedded_first_look();
 
 }  // namespace mgca::detail

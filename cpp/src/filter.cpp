@@ -1,13 +1,10 @@
 // The public door; the flow of one pair, one call per step, in order; mgca_filter/match_filter.py.
 
-#include "embedded_model.hpp"
 #include "focal_estimate.hpp"
 #include "mirror.hpp"
-#include "model_file.hpp"
-#include "network.hpp"
+#include "model.hpp"
 #include "robust_fit.hpp"
 #include "scoring.hpp"
-#include "sha256.hpp"
 #include "verdict.hpp"
 
 #include <mgca/filter.hpp>
@@ -16,17 +13,13 @@
 #include <cmath>
 #include <initializer_list>
 #include <iomanip>
+#include <memory>
 #include <sstream>
-#include <string_view>
+#include <string>
 #include <utility>
+#include <vector>
 
 namespace mgca {
-
-struct Model::State {
-    detail::ModelMetadata metadata;
-    std::string sha256;
-    std::unique_ptr<detail::Network> network;
-};
 
 namespace {
 
@@ -49,22 +42,6 @@ void check(const Options& options) {
     if (options.seed < 0) {
         throw ArgumentError("seed: expected 0 or more, got " + std::to_string(options.seed));
     }
-}
-
-void check(const RuntimeOptions& options) {
-    if (options.threads < 0) {
-        throw ArgumentError("threads: expected 0 or more, got " + std::to_string(options.threads));
-    }
-}
-
-std::shared_ptr<const Model::State> open_model(std::string_view content, const std::string& source,
-                                               const std::filesystem::path& file, const RuntimeOptions& options) {
-    check(options);
-    auto state = std::make_shared<Model::State>();
-    state->metadata = detail::read_metadata(content, source);
-    state->sha256 = detail::sha256(content);
-    state->network = detail::open_network(content, source, file, options);
-    return state;
 }
 
 /// Mask that asks the scores alone.
@@ -102,6 +79,241 @@ std::string empty_sentence(double precision, const std::vector<float>& scores) {
              << ": the status speaks of the geometry alone; a threshold keeps what agrees with it";
     return sentence.str();
 }
+
+/// One pair on its way, step by step.
+class Job {
+public:
+    using Networks = std::vector<std::shared_ptr<const detail::OpenNetwork>>;
+
+    /// Read the pair.
+    Job(const MatchPair& matches, const Networks& networks, const Options& options)
+        : networks_(networks), options_(options), deepest_(networks.back()->metadata),
+          pair_(detail::prepare_pair(matches)), given_(pair_.calibrated()) {
+        if (options.geometry == Geometry::essential && !given_) {
+            throw ArgumentError("camera1.K: the geometry 'essential' needs the intrinsics");
+        }
+        if (options.geometry == Geometry::fundamental) {
+            pair_.intrinsics1.guessed = pair_.intrinsics2.guessed = true;
+        }
+    }
+
+    Result run() {
+        if (!explain_by_list()) {
+            ask_networks();
+        }
+        score();
+        const detail::Verdict verdict = judge();
+        describe(verdict);
+        return std::move(result_);
+    }
+
+private:
+    /// A run on the list alone may explain it.
+    bool explain_by_list() {
+        if (options_.method == Method::none) {
+            return false;
+        }
+        evidence_ = detail::gather_before(pair_);
+        if (options_.geometry != Geometry::homography) {
+            search_.emplace(*evidence_, deepest_.choice, options_);
+            if (options_.method == Method::automatic && options_.effort == Effort::automatic) {
+                model_ = search_->before_network();
+            }
+        }
+        return model_.has_value();
+    }
+
+    /// Networks, the quickest first, until one settles the pair; each sees what those before it left undecided.
+    void ask_networks() {
+        rows_ = detail::select_network_input(pair_, networks_.front()->metadata, options_.seed);
+        detail::Rows sent = rows_;
+        for (const auto& one : networks_) {
+            const auto output = detail::run_network(*one->network, pair_, sent);
+            if (output) {
+                result_.network_essential = output->essential;
+            }
+            result_.networks.push_back(one->metadata.name);
+            const auto opinion =
+                detail::Opinion::of(detail::assemble_logits(pair_, sent, output, one->metadata), one->metadata);
+            opinion_ = opinion_ ? opinion_->joined(opinion, sent) : opinion;
+            const bool last = one == networks_.back();
+            if (last || options_.effort == Effort::automatic) {
+                fit(last);
+            }
+            if (model_) {
+                return;
+            }
+            sent = opinion_->undecided(sent);
+        }
+    }
+
+    /// Scores by the networks that were asked.
+    std::vector<float> scores_by_networks() const {
+        std::vector<float> scores(pair_.valid.size(), 0.0F);
+        for (std::size_t i = 0; i < scores.size(); ++i) {
+            if (pair_.valid[i] != 0) {
+                scores[i] = detail::sigmoid(opinion_->log_odds[i]);
+            }
+        }
+        return scores;
+    }
+
+    /// The model on what the first network saw; unless no deeper one is left, where the scores so far settle it.
+    void fit(bool last) {
+        if (!evidence_) {
+            return;
+        }
+        const std::vector<float> scores = scores_by_networks();
+        evidence_ = detail::gather_scored(pair_, rows_, scores, opinion_->margins, network_essential());
+        if (search_) {
+            model_ = last ? search_->with_network(*evidence_) : search_->after_first_look(*evidence_);
+        }
+        if (model_ && !given_ && options_.geometry == Geometry::automatic) {
+            fit_under_estimated_focal(scores);
+        }
+    }
+
+    /// A second fit, of an essential matrix, where the matches tell the focal lengths that were guessed.
+    void fit_under_estimated_focal(const std::vector<float>& scores) {
+        for (const detail::FocalEstimate& estimate : detail::estimate_focals(*evidence_, model_->M)) {
+            detail::PairInput zoomed = pair_.with_focals(estimate.factors);
+            cv::Matx33d E = network_essential();
+            if (detail::usable(E)) {
+                E = detail::project_to_essential(zoom_of(estimate.factors[1]) * E * zoom_of(estimate.factors[0]));
+            }
+            detail::Evidence scored = detail::gather_scored(zoomed, rows_, scores, opinion_->margins, E);
+            detail::Search again(detail::gather_before(zoomed), deepest_.choice, options_);
+            auto better = again.with_network(scored);
+            if (better && detail::agrees_as_well(scored, *better, *evidence_, *model_)) {
+                pair_ = std::move(zoomed);
+                evidence_ = std::move(scored);
+                model_ = std::move(better);
+                focal_ = estimate;
+                return;
+            }
+        }
+    }
+
+    /// Scores and logits of all matches: by the networks, or, of a pair that needed none, by the residuals.
+    void score() {
+        if (opinion_) {
+            result_.scores = scores_by_networks();
+            for (const float margin : opinion_->margins) {
+                result_.logits.push_back(margin + static_cast<float>(deepest_.decision_threshold));
+            }
+            return;
+        }
+        result_.scores = detail::scores_by_residuals(pair_, *model_, deepest_.choice);
+        for (std::size_t i = 0; i < result_.scores.size(); ++i) {
+            result_.logits.push_back(pair_.valid[i] != 0 ? deepest_.calibration.logit(result_.scores[i])
+                                                         : detail::kInvalidLogit);
+        }
+    }
+
+    /// Re-test of all matches, and the verdict.
+    detail::Verdict judge() {
+        if (!evidence_) {
+            return detail::verdict_by_scores(pair_, keep_by_scores(pair_, result_.scores, options_));
+        }
+        const double threshold_px = pair_.threshold_px(options_.threshold);
+        detail::Verdict verdict = options_.geometry == Geometry::homography
+                                      ? detail::judge_homography(pair_, *evidence_, threshold_px, options_)
+                                      : detail::judge(pair_, model_, *evidence_, threshold_px, deepest_.choice, options_);
+        if (focal_ && verdict.status == Status::suspicious_intrinsics) {
+            // The intrinsics are nobody's claim.
+            verdict.status = verdict.H ? Status::planar : Status::low_support;
+        }
+        if (focal_ && verdict.status == Status::planar) {
+            verdict.E.reset();  // a plane tells no focal length
+            verdict.R.reset();
+            verdict.t.reset();
+        }
+        if (!given_ && !focal_ && options_.geometry == Geometry::automatic && verdict.t) {
+            verdict.E.reset();  // nor do matches that no focal length explains
+            verdict.R.reset();
+            verdict.t.reset();
+        }
+        verdict = detail::judge_mirror(pair_, *evidence_, std::move(verdict), threshold_px, options_);
+        if (focal_ && model_->confidence && verdict.t) {
+            // A pose is no surer than its focal lengths; the matches are not in doubt with it.
+            result_.fitted_confidence = model_->confidence;
+            result_.focal_sigma_deg = detail::pose_sigma_deg(*evidence_, *model_, *focal_);
+            model_->confidence = detail::confidence_under_estimate(*model_->confidence, *result_.focal_sigma_deg);
+            if (verdict.status == Status::ok && *model_->confidence < deepest_.choice.verdict[1]) {
+                verdict.status = Status::low_support;
+                result_.focal_doubt = true;
+            }
+        }
+        if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
+            verdict.mask = keep_by_scores(pair_, result_.scores, options_);
+        }
+        return verdict;
+    }
+
+    /// The rest of the answer.
+    void describe(const detail::Verdict& verdict) {
+        result_.status = verdict.status;
+        result_.mask = verdict.mask;
+        result_.num_inliers = static_cast<int>(std::count(result_.mask.begin(), result_.mask.end(), 1));
+        result_.E = verdict.E;
+        result_.F = verdict.F;
+        result_.R = verdict.R;
+        result_.t = verdict.t;
+        result_.H = verdict.H;
+        result_.support = verdict.support;
+        result_.log10_false_alarms = verdict.log10_false_alarms;
+        result_.translation_sigma_deg = verdict.translation_sigma_deg;
+        result_.focal_factor = verdict.focal_factor;
+        result_.mirrored = verdict.mirrored;
+        result_.num_network_matches = static_cast<int>(rows_.size());
+        const auto threshold = static_cast<float>(deepest_.decision_threshold);
+        result_.num_accepted = static_cast<int>(std::count_if(result_.logits.begin(), result_.logits.end(),
+                                                              [&](float logit) { return logit > threshold; }));
+        if (model_) {
+            result_.fitted_essential = model_->E;
+            result_.origin = model_->origin;
+            result_.ended = model_->ended;
+            if (verdict.t) {
+                result_.confidence = model_->confidence;
+            }
+        }
+        result_.intrinsics = given_ ? IntrinsicsSource::given : IntrinsicsSource::guessed;
+        result_.assumptions = pair_.assumptions;
+        if (focal_) {
+            result_.intrinsics = IntrinsicsSource::estimated;
+            const cv::Matx33d &K1 = pair_.intrinsics1.K, &K2 = pair_.intrinsics2.K;
+            const cv::Vec2d focal_px(detail::mean_focal_length(K1, K1), detail::mean_focal_length(K2, K2));
+            result_.focal_px = focal_px / pair_.unit_px;
+            result_.focal_sigma = focal_->sigmas;
+            for (std::string& sentence : focal_sentences(*result_.focal_px, focal_->sigmas)) {
+                result_.assumptions.push_back(std::move(sentence));
+            }
+        }
+        if (verdict.mirrored) {
+            result_.assumptions.push_back(
+                "one of the images is mirrored: the matches agree with a view that no camera has");
+        }
+        if (options_.keep_precision && result_.num_inliers == 0 && (result_.F || result_.R || result_.H)) {
+            result_.assumptions.push_back(empty_sentence(*options_.keep_precision, result_.scores));
+        }
+    }
+
+    /// The network E of the network that was asked last, or zeros.
+    cv::Matx33d network_essential() const { return result_.network_essential.value_or(cv::Matx33d()); }
+
+    const Networks& networks_;
+    const Options& options_;
+    const detail::ModelMetadata& deepest_;
+    detail::PairInput pair_;
+    bool given_;  // the intrinsics
+    std::optional<detail::Evidence> evidence_;
+    std::optional<detail::Search> search_;
+    std::optional<detail::TwoViewModel> model_;
+    detail::Rows rows_;  // that the first network saw
+    std::optional<detail::Opinion> opinion_;
+    std::optional<detail::FocalEstimate> focal_;
+    Result result_;
+};
 
 template <typename Value>
 Value by_word(const char* name, const std::string& word, std::initializer_list<std::pair<const char*, Value>> values) {
@@ -161,197 +373,10 @@ Geometry to_geometry(const std::string& word) {
                               {"homography", Geometry::homography}});
 }
 
-Model Model::from_file(const std::filesystem::path& file, const RuntimeOptions& options) {
-    return Model(open_model(detail::read_model_file(file), file.string(), file, options));
-}
-
-Model Model::from_memory(const void* data, std::size_t size, const RuntimeOptions& options) {
-    if (data == nullptr) {
-        throw ArgumentError("data: expected the bytes of a model file");
-    }
-    return Model(open_model({static_cast<const char*>(data), size}, "model in memory", {}, options));
-}
-
-bool has_embedded_model() noexcept { return !detail::embedded_model().empty(); }
-
-Model embedded_model(const RuntimeOptions& options) {
-    if (!has_embedded_model()) {
-        throw ModelError("this library was built without a model in it (MGCA_EMBED_MODEL=ON); use Model::from_file");
-    }
-    return Model(open_model(detail::embedded_model(), "embedded model", {}, options));
-}
-
-const std::string& Model::name() const noexcept { return state_->metadata.name; }
-
-const std::string& Model::version() const noexcept { return state_->metadata.version; }
-
-const std::string& Model::sha256() const noexcept { return state_->sha256; }
-
-const std::vector<std::string>& Model::notes() const noexcept { return state_->network->notes(); }
-
-std::string Model::runtime() { return detail::runtime_name(); }
-
 Filter::Filter(Model model, const Options& options) : model_(std::move(model)), options_(options) { check(options); }
 
-Result Filter::operator()(const MatchPair& matches) const {
-    const detail::ModelMetadata& metadata = model_.state_->metadata;
-    // 1. Read the pair.
-    detail::PairInput pair = detail::prepare_pair(matches);
-    const bool given = pair.calibrated();
-    if (options_.geometry == Geometry::essential && !given) {
-        throw ArgumentError("camera1.K: the geometry 'essential' needs the intrinsics");
-    }
-    if (options_.geometry == Geometry::fundamental) {
-        pair.intrinsics1.guessed = pair.intrinsics2.guessed = true;
-    }
-    Result result;
-    result.intrinsics = given ? IntrinsicsSource::given : IntrinsicsSource::guessed;
-
-    // 2. A run on the list alone may explain it.
-    std::optional<detail::Evidence> evidence;
-    std::optional<detail::Search> search;
-    std::optional<detail::TwoViewModel> model;
-    if (options_.method != Method::none) {
-        evidence = detail::gather_before(pair);
-        if (options_.geometry != Geometry::homography) {
-            search.emplace(*evidence, metadata.choice, options_);
-            if (options_.method == Method::automatic && options_.effort == Effort::automatic) {
-                model = search->before_network();
-            }
-        }
-    }
-
-    // 3. Scores: from the residuals, or by the network, and the fit on what it saw.
-    const std::size_t count = pair.valid.size();
-    std::optional<detail::FocalEstimate> focal;
-    if (model) {
-        result.scores = detail::scores_by_residuals(pair, *model, metadata.choice);
-        for (std::size_t i = 0; i < count; ++i) {
-            result.logits.push_back(pair.valid[i] != 0 ? metadata.calibration.logit(result.scores[i])
-                                                       : detail::kInvalidLogit);
-        }
-    } else {
-        const detail::Rows sent = detail::select_network_input(pair, metadata, options_.seed);
-        const auto output = detail::run_network(*model_.state_->network, pair, sent);
-        result.num_network_matches = static_cast<int>(sent.size());
-        result.logits = detail::assemble_logits(pair, sent, output, metadata);
-        std::vector<float> margins;
-        for (std::size_t i = 0; i < count; ++i) {
-            result.scores.push_back(pair.valid[i] != 0 ? metadata.calibration.probability(result.logits[i]) : 0.0F);
-            margins.push_back(result.logits[i] - static_cast<float>(metadata.decision_threshold));
-        }
-        const cv::Matx33d essential = output ? output->essential : cv::Matx33d();
-        if (output) {
-            result.network_essential = essential;
-        }
-        if (evidence) {
-            evidence = detail::gather_scored(pair, sent, result.scores, margins, essential);
-        }
-        if (search) {
-            model = search->with_network(*evidence);
-        }
-        if (model && !given && options_.geometry == Geometry::automatic) {
-            // A second fit, of an essential matrix, where the matches tell the focal lengths that were guessed.
-            for (const detail::FocalEstimate& estimate : detail::estimate_focals(*evidence, model->M)) {
-                detail::PairInput zoomed = pair.with_focals(estimate.factors);
-                cv::Matx33d E = essential;
-                if (detail::usable(E)) {
-                    E = detail::project_to_essential(zoom_of(estimate.factors[1]) * E * zoom_of(estimate.factors[0]));
-                }
-                detail::Evidence scored = detail::gather_scored(zoomed, sent, result.scores, margins, E);
-                detail::Search again(detail::gather_before(zoomed), metadata.choice, options_);
-                auto better = again.with_network(scored);
-                if (better && detail::agrees_as_well(scored, *better, *evidence, *model)) {
-                    pair = std::move(zoomed);
-                    evidence = std::move(scored);
-                    model = std::move(better);
-                    focal = estimate;
-                    break;
-                }
-            }
-        }
-    }
-
-    // 4. Re-test of all matches, and the verdict.
-    detail::Verdict verdict;
-    if (!evidence) {
-        verdict = detail::verdict_by_scores(pair, keep_by_scores(pair, result.scores, options_));
-    } else {
-        const double threshold_px = pair.threshold_px(options_.threshold);
-        verdict = options_.geometry == Geometry::homography
-                      ? detail::judge_homography(pair, *evidence, threshold_px, options_)
-                      : detail::judge(pair, model, *evidence, threshold_px, metadata.choice, options_);
-        if (focal && verdict.status == Status::suspicious_intrinsics) {
-            // The intrinsics are nobody's claim.
-            verdict.status = verdict.H ? Status::planar : Status::low_support;
-        }
-        if (focal && verdict.status == Status::planar) {
-            verdict.E.reset();  // a plane tells no focal length
-            verdict.R.reset();
-            verdict.t.reset();
-        }
-        if (!given && !focal && options_.geometry == Geometry::automatic && verdict.t) {
-            verdict.E.reset();  // nor do matches that no focal length explains
-            verdict.R.reset();
-            verdict.t.reset();
-        }
-        verdict = detail::judge_mirror(pair, *evidence, std::move(verdict), threshold_px, options_);
-        if (focal && model->confidence && verdict.t) {
-            // A pose is no surer than its focal lengths; the matches are not in doubt with it.
-            result.fitted_confidence = model->confidence;
-            result.focal_sigma_deg = detail::pose_sigma_deg(*evidence, *model, *focal);
-            model->confidence = detail::confidence_under_estimate(*model->confidence, *result.focal_sigma_deg);
-            if (verdict.status == Status::ok && *model->confidence < metadata.choice.verdict[1]) {
-                verdict.status = Status::low_support;
-                result.focal_doubt = true;
-            }
-        }
-        if (options_.keep_precision && (verdict.F || verdict.R || verdict.H)) {
-            verdict.mask = keep_by_scores(pair, result.scores, options_);
-        }
-    }
-    result.num_accepted = static_cast<int>(
-        std::count_if(result.logits.begin(), result.logits.end(),
-                      [&](float logit) { return logit > static_cast<float>(metadata.decision_threshold); }));
-    if (model) {
-        result.fitted_essential = model->E;
-        result.origin = model->origin;
-        result.ended = model->ended;
-        if (verdict.t) {
-            result.confidence = model->confidence;
-        }
-    }
-    result.assumptions = pair.assumptions;
-    if (focal) {
-        result.intrinsics = IntrinsicsSource::estimated;
-        const cv::Matx33d &K1 = pair.intrinsics1.K, &K2 = pair.intrinsics2.K;
-        const cv::Vec2d focal_px(detail::mean_focal_length(K1, K1), detail::mean_focal_length(K2, K2));
-        result.focal_px = focal_px / pair.unit_px;
-        result.focal_sigma = focal->sigmas;
-        for (std::string& sentence : focal_sentences(*result.focal_px, focal->sigmas)) {
-            result.assumptions.push_back(std::move(sentence));
-        }
-    }
-    if (verdict.mirrored) {
-        result.assumptions.push_back("one of the images is mirrored: the matches agree with a view that no camera has");
-    }
-    result.translation_sigma_deg = verdict.translation_sigma_deg;
-    result.status = verdict.status;
-    result.mask = std::move(verdict.mask);
-    result.mirrored = verdict.mirrored;
-    result.num_inliers = static_cast<int>(std::count(result.mask.begin(), result.mask.end(), 1));
-    result.E = verdict.E;
-    result.F = verdict.F;
-    result.R = verdict.R;
-    result.t = verdict.t;
-    result.H = verdict.H;
-    result.support = verdict.support;
-    result.log10_false_alarms = verdict.log10_false_alarms;
-    result.focal_factor = verdict.focal_factor;
-    if (options_.keep_precision && result.num_inliers == 0 && (result.F || result.R || result.H)) {
-        result.assumptions.push_back(empty_sentence(*options_.keep_precision, result.scores));
-    }
-    return result;
+Result Filter::operator()(const MatchPair& pair) const {
+    return Job(pair, model_.state_->networks, options_).run();
 }
 
 Result Filter::operator()(const Keypoints& keypoints1, const Keypoints& keypoints2, const Matches& matches,

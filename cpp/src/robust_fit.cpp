@@ -4,6 +4,7 @@
 #include "pose_refinement.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <utility>
 
@@ -25,11 +26,11 @@ constexpr Proposal kScoreOrder{"score order", Family::score_order, Source::above
 constexpr Proposal kListOrder{"list order", Family::list_ordered, Source::listed, Estimator::prosac, 0.5, 1000, 0};
 constexpr Proposal kScoreOrderAll{
     "score order, all", Family::score_order, Source::above, Estimator::prosac, 0.5, 1000, 3, -2.0};
-constexpr Proposal kScoreOrderFine{
-    "score order, fine", Family::score_order, Source::above, Estimator::prosac, 0.5, 1000, 1, -1.0};
-constexpr Proposal kScoreOrderBest{
-    "score order, best", Family::score_order, Source::above, Estimator::prosac, 1.0, 1000, 2, 0.0};
-constexpr Proposal kAcceptedMore{"accepted, more", Family::accepted, Source::accepted, Estimator::magsac, 0.5, 1000, 3};
+
+// What needs no network; then what uses it; then what is still tried where those do not settle it.
+constexpr std::array kBeforeNetwork{kList, kListCoarse};
+constexpr std::array kFirst{kNetwork, kAccepted, kScoreOrder};
+constexpr std::array kSecond{kListCoarse, kListOrder, kScoreOrderAll};
 
 /// One robust estimator alone, for those who ask for it.
 std::optional<Proposal> alone(Method method) {
@@ -85,8 +86,8 @@ std::optional<TwoViewModel> Search::before_network() {
     if (evidence_.size() < kMinMatches || !evidence_.calibrated) {
         return std::nullopt;
     }
-    for (const Proposal& proposal : {kList, kListCoarse}) {
-        propose({proposal});
+    for (const Proposal& proposal : kBeforeNetwork) {
+        propose(proposal);
         const double share = explained();
         if (share < kPromising) {
             return std::nullopt;
@@ -103,6 +104,21 @@ std::optional<TwoViewModel> Search::before_network() {
     return refined(std::move(model));
 }
 
+std::optional<TwoViewModel> Search::after_first_look(Evidence evidence) {
+    if (evidence.size() < kMinMatches || !evidence.calibrated || options_.method != Method::automatic) {
+        return std::nullopt;
+    }
+    take(std::move(evidence));
+    for (const Proposal& proposal : kFirst) {
+        propose(proposal);
+    }
+    if (!settled()) {
+        return std::nullopt;
+    }
+    propose_twins();
+    return refined(chosen("first sources"));
+}
+
 std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
     take(std::move(evidence));
     if (evidence_.size() < kMinMatches) {
@@ -113,26 +129,25 @@ std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
     }
     if (const auto one = alone(options_.method)) {
         poses_.clear();
-        propose({*one});
+        propose(*one);
         return refined(chosen("all sources"));
     }
-    propose({kNetwork, kAccepted, kScoreOrder});
+    for (const Proposal& proposal : kFirst) {
+        propose(proposal);
+    }
     const char* ended = "first sources";
     if (!settled()) {
         ended = "all sources";
         if (!poses_.empty()) {
             propose_twins();
         }
-        std::vector<Proposal> second;
-        for (const Proposal& proposal :
-             {kListCoarse, kListOrder, kScoreOrderAll, kScoreOrderFine, kScoreOrderBest, kAcceptedMore}) {
+        for (const Proposal& proposal : kSecond) {
             const bool known = std::any_of(poses_.begin(), poses_.end(),
                                            [&](const Found& pose) { return pose.origin == proposal.name; });
             if (!known) {
-                second.push_back(proposal);
+                propose(proposal);
             }
         }
-        propose(second);
     }
     if (!poses_.empty()) {
         propose_twins();
@@ -164,12 +179,10 @@ std::vector<cv::Matx33d> Search::run(const Proposal& proposal) const {
     return detail::propose(proposal, evidence_, options);
 }
 
-void Search::propose(const std::vector<Proposal>& proposals) {
-    for (const Proposal& proposal : proposals) {
-        for (const cv::Matx33d& E : run(proposal)) {
-            if (const auto pose = pose_from_essential(E, fitted_, evidence_.focal_px)) {
-                add({*pose, proposal.family, proposal.name});
-            }
+void Search::propose(const Proposal& proposal) {
+    for (const cv::Matx33d& E : run(proposal)) {
+        if (const auto pose = pose_from_essential(E, fitted_, evidence_.focal_px)) {
+            add({*pose, proposal.family, proposal.name});
         }
     }
 }

@@ -1,7 +1,8 @@
 // The robust fit: what is proposed, refined, chosen, in this order; mgca_filter/fit/robust_fit.py.
 //
 // An easy pair ends before the network: a run or two on the list alone explain it, no other pose comes near, and its
-// inliers hold it firmly. Otherwise unlike sources propose; where the first of them agree, the others are left out.
+// inliers hold it firmly. Otherwise unlike sources propose, on the scores of a quick network; where the first of
+// them agree, the deeper network and the other sources are left out.
 
 #pragma once
 
@@ -43,6 +44,9 @@ public:
     /// The model of a list that explains itself; nothing where the network is wanted.
     std::optional<TwoViewModel> before_network();
 
+    /// The model where the scores of a quick network settle it; nothing where a deeper one is wanted.
+    std::optional<TwoViewModel> after_first_look(Evidence evidence);
+
     /// The model by all sources, on scored matches; nothing where none is found.
     std::optional<TwoViewModel> with_network(Evidence evidence);
 
@@ -58,7 +62,7 @@ private:
 
     void take(Evidence evidence);
     std::vector<cv::Matx33d> run(const Proposal& proposal) const;
-    void propose(const std::vector<Proposal>& proposals);
+    void propose(const Proposal& proposal);
     void propose_twins();
     void add(Found found);
     int near(const Pose& pose) const;

@@ -24,6 +24,39 @@ float below(double logit, double ceiling) {
 
 }  // namespace
 
+Opinion Opinion::of(const std::vector<float>& logits, const ModelMetadata& metadata) {
+    Opinion opinion;
+    for (const float logit : logits) {
+        opinion.margins.push_back(logit - static_cast<float>(metadata.decision_threshold));
+        opinion.log_odds.push_back(metadata.calibration.log_odds(logit));
+    }
+    return opinion;
+}
+
+Opinion Opinion::joined(const Opinion& other, const Rows& rows) const {
+    Opinion all = *this;
+    all.networks += other.networks;
+    const auto share = static_cast<float>(static_cast<double>(other.networks) / all.networks);
+    for (const std::size_t i : rows) {
+        all.margins[i] += (other.margins[i] - all.margins[i]) * share;
+        all.log_odds[i] += (other.log_odds[i] - all.log_odds[i]) * share;
+    }
+    return all;
+}
+
+Rows Opinion::undecided(const Rows& rows) const {
+    const auto hopeless = static_cast<float>(std::log(kHopelessScore / (1.0 - kHopelessScore)));
+    Rows best = rows;
+    std::stable_sort(best.begin(), best.end(), [&](std::size_t a, std::size_t b) { return log_odds[a] > log_odds[b]; });
+    std::size_t count = std::min(kFewestUndecided, best.size());
+    while (count < best.size() && log_odds[best[count]] > hopeless) {
+        ++count;
+    }
+    best.resize(count);
+    std::sort(best.begin(), best.end());
+    return best;
+}
+
 Rows select_network_input(const PairInput& pair, const ModelMetadata& metadata, int seed) {
     Rows valid, rows;
     std::vector<EncodedAttributes> attributes;

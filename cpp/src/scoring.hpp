@@ -1,4 +1,5 @@
-// Scores of all matches of a pair: who enters the network, and what the others get; mgca_filter/inference/scoring.py.
+// Scores of all matches of a pair: who enters a network, what the others get, and what several networks say together;
+// mgca_filter/inference/scoring.py.
 
 #pragma once
 
@@ -14,6 +15,25 @@ namespace mgca::detail {
 
 // Logit of a match without usable coordinates: low enough for a probability of zero under any calibration.
 constexpr float kInvalidLogit = -100.0F;
+// What scores less is no match for sure: a deeper network need not see it, unless there would be too few.
+constexpr double kHopelessScore = 1e-3;
+constexpr std::size_t kFewestUndecided = 64;
+
+/// What the networks that were asked say of all matches of a pair, each as much as another.
+struct Opinion {
+    std::vector<float> margins;   // logits above the decision threshold
+    std::vector<float> log_odds;  // calibrated
+    int networks = 1;             // how many were asked
+
+    /// What one network says, whose logits these are.
+    static Opinion of(const std::vector<float>& logits, const ModelMetadata& metadata);
+
+    /// With what one more network says of the matches `rows` that it saw.
+    Opinion joined(const Opinion& other, const Rows& rows) const;
+
+    /// Those of the matches `rows` that a deeper network should see; a few, the best, in any case.
+    Rows undecided(const Rows& rows) const;
+};
 
 /// Rows of the candidates among the valid matches, ascending, at most 8000: the best by ratio, and a seeded sample of
 /// equals.

@@ -103,6 +103,10 @@ static void options_are_felt(const mgca_model *model) {
     check(mgca_filter_set_word(filter, "effort", "full") == MGCA_DONE, "effort");
     mgca_filter_points(filter, points1, points2, ratio, COUNT, K, NULL, &result);
     check(mgca_result_number(result, "num_network_matches") > 0.0, "effort is felt");
+    check(mgca_result_network(result, 0) != NULL && mgca_result_network(result, 1) != NULL &&
+              strcmp(mgca_result_network(result, 0), mgca_result_network(result, 1)) != 0 &&
+              mgca_result_network(result, 2) == NULL,
+          "both networks are asked");
     check(strcmp(mgca_result_word(result, "origin"), "magsac") == 0, "method is felt");
     mgca_result_free(result);
     check(mgca_filter_set_number(filter, "threshold", 0.001) == MGCA_DONE, "threshold");
@@ -195,7 +199,7 @@ static void pairs_are_read(const mgca_filter *filter) {
     mgca_pair_free(pair);
 }
 
-static void models_are_checked(const char *file) {
+static void models_are_checked(const char *file, const char *quick) {
     mgca_model *model = NULL;
     fails(mgca_model_open("no such file.onnx", 1, NULL, &model), MGCA_MODEL_ERROR, "model file not found");
     check(model == NULL, "no model where a call failed");
@@ -205,7 +209,8 @@ static void models_are_checked(const char *file) {
     fails(mgca_model_open_memory(NULL, 0, 1, NULL, &model), MGCA_ARGUMENT_ERROR, "data");
     fails(mgca_filter_create(NULL, NULL), MGCA_ARGUMENT_ERROR, "must not be NULL");
 #if MGCA_TEST_EMBEDDED
-    check(mgca_model_open(NULL, 1, NULL, &model) == MGCA_DONE, "the embedded model");
+    check(mgca_model_open(NULL, 1, NULL, &model) == MGCA_DONE, "the embedded models");
+    check((strstr(mgca_model_name(model), " + ") != NULL) == (MGCA_TEST_EMBEDDED == 2), "all of them");
 #else
     fails(mgca_model_open(NULL, 1, NULL, &model), MGCA_MODEL_ERROR, "MGCA_EMBED_MODEL");
 #endif
@@ -213,6 +218,21 @@ static void models_are_checked(const char *file) {
     mgca_model_close(NULL);
     check(mgca_model_open(file, 1, "NoSuchExecutionProvider", &model) == MGCA_DONE, "a provider gives way");
     check(strstr(mgca_model_note(model, 0), "has no NoSuchExecutionProvider") != NULL, "with a note");
+    mgca_model_close(model);
+    mgca_model *first_look = NULL, *both = NULL;
+    check(mgca_model_open(file, 1, NULL, &model) == MGCA_DONE, "a model");
+    check(mgca_model_open(quick, 1, NULL, &first_look) == MGCA_DONE, "a first look");
+    check(mgca_model_with_first_look(model, first_look, &both) == MGCA_DONE, "both");
+    check(strlen(mgca_model_sha256(both)) == 64 + 3 + 64, "two digests");
+    check(strncmp(mgca_model_sha256(both), mgca_model_sha256(first_look), 64) == 0, "in the order of asking");
+    mgca_model *three = NULL;
+    fails(mgca_model_with_first_look(both, first_look, &three), MGCA_ARGUMENT_ERROR, "one file each");
+    fails(mgca_model_with_first_look(NULL, first_look, &three), MGCA_ARGUMENT_ERROR, "model: must not be NULL");
+    fails(mgca_model_with_first_look(model, NULL, &three), MGCA_ARGUMENT_ERROR, "first_look: must not be NULL");
+    fails(mgca_model_with_first_look(model, first_look, NULL), MGCA_ARGUMENT_ERROR, "both: must not be NULL");
+    check(three == NULL, "no model where a call failed");
+    mgca_model_close(both);
+    mgca_model_close(first_look);
     mgca_model_close(model);
     mgca_filter_free(NULL);
     mgca_pair_free(NULL);
@@ -223,21 +243,31 @@ static void models_are_checked(const char *file) {
     check(strlen(mgca_version()) >= 5, "version");
 }
 
+/* A model of two files, which are closed again. */
+static mgca_model *open_both(const char *file, const char *quick) {
+    mgca_model *model = NULL, *first_look = NULL, *both = NULL;
+    check(mgca_model_open(file, 2, " CPUExecutionProvider ,", &model) == MGCA_DONE, "a model");
+    check(mgca_model_open(quick, 2, NULL, &first_look) == MGCA_DONE, "a first look");
+    check(mgca_model_with_first_look(model, first_look, &both) == MGCA_DONE, "both");
+    mgca_model_close(model);
+    mgca_model_close(first_look);
+    return both;
+}
+
 int main(int argc, char **argv) {
-    if (argc != 2) {
-        fprintf(stderr, "usage: test_c_interface MODEL\n");
+    if (argc != 3) {
+        fprintf(stderr, "usage: test_c_interface MODEL FIRST_LOOK\n");
         return 2;
     }
     make_pair();
-    models_are_checked(argv[1]);
-    mgca_model *model = NULL;
+    models_are_checked(argv[1], argv[2]);
+    mgca_model *model = open_both(argv[1], argv[2]);
     mgca_filter *filter = NULL;
-    check(mgca_model_open(argv[1], 2, " CPUExecutionProvider ,", &model) == MGCA_DONE, "a model");
     if (model == NULL || mgca_filter_create(model, &filter) != MGCA_DONE) {
         return 1;
     }
     check(strlen(mgca_model_name(model)) > 0 && strlen(mgca_model_version(model)) > 0, "name and version");
-    check(strlen(mgca_model_sha256(model)) == 64 && mgca_model_note(model, 0) == NULL, "digest, and no notes");
+    check(mgca_model_note(model, 0) == NULL, "no notes");
     options_are_felt(model);
     mgca_model_close(model); /* the filter goes on */
     finds_the_pose(filter);

@@ -1,6 +1,7 @@
 # Install what was built, and link programs of a user's own to it: by find_package, by pkg-config, by FetchContent.
 #
-# cmake -D BUILD=... -D CONFIG=... -D SOURCE=... -D MODEL=... -D GENERATOR=... -D ROOT=... -D EMBEDDED=ON -P test_install.cmake
+# cmake -D BUILD=... -D CONFIG=... -D SOURCE=... -D MODEL=... -D FIRST_LOOK=... -D GENERATOR=... -D ROOT=... -D EMBEDDED=ON
+#       -P test_install.cmake
 
 set(WORK "${BUILD}/install_test")
 file(REMOVE_RECURSE "${WORK}")
@@ -22,22 +23,24 @@ unset(ENV{ONNXRUNTIME_ROOT})
 run(${CMAKE_COMMAND} -S "${SOURCE}/examples/cpp" -B "${WORK}/find" -G "${GENERATOR}" "-DCMAKE_PREFIX_PATH=${PREFIX}"
   "-DCMAKE_BUILD_TYPE=${CONFIG}" "-DCMAKE_CXX_FLAGS=-Wall -Wextra")
 run(${CMAKE_COMMAND} --build "${WORK}/find" --config "${CONFIG}")
-run("${WORK}/find/filter_matches" "${MODEL}")
-if(NOT OUTPUT MATCHES "^ok: ")
-  message(FATAL_ERROR "filter_matches: ${OUTPUT}")
-endif()
+foreach(models "${MODEL}" "${MODEL};${FIRST_LOOK}")
+  run("${WORK}/find/filter_matches" ${models})
+  if(NOT OUTPUT MATCHES "^ok: ")
+    message(FATAL_ERROR "filter_matches ${models}: ${OUTPUT}")
+  endif()
+endforeach()
 
 if(EMBEDDED)
   run("${WORK}/find/filter_matches")
   if(NOT OUTPUT MATCHES "^ok: ")
-    message(FATAL_ERROR "filter_matches with the embedded model: ${OUTPUT}")
+    message(FATAL_ERROR "filter_matches with the embedded models: ${OUTPUT}")
   endif()
 endif()
 
 file(GLOB ODOMETRY "${WORK}/find/odometry*")
 if(ODOMETRY)  # OpenCV has the modules for it
   foreach(source orb flow)
-    run("${WORK}/find/odometry" "${SOURCE}/examples/images" 800,800,319.5,239.5 ${source} "${MODEL}")
+    run("${WORK}/find/odometry" "${SOURCE}/examples/images" 800,800,319.5,239.5 ${source} "${MODEL}" "${FIRST_LOOK}")
     if(NOT OUTPUT MATCHES "1 pairs: features and matching [0-9.]+ ms, filter [0-9.]+ ms per frame")
       message(FATAL_ERROR "odometry ${source}: ${OUTPUT}")
     endif()

@@ -33,7 +33,7 @@ std::string read_bytes(const std::filesystem::path& file) {
 }
 
 bool same(const Result& a, const Result& b) {
-    return a.mask == b.mask && a.scores == b.scores && a.logits == b.logits && a.status == b.status &&
+    return a.networks == b.networks && a.mask == b.mask && a.scores == b.scores && a.logits == b.logits && a.status == b.status &&
            a.R.has_value() == b.R.has_value() && (!a.R || cv::norm(*a.R - *b.R) == 0.0);
 }
 
@@ -331,17 +331,67 @@ void memory_and_file_agree(const std::filesystem::path& file, const Model& model
     check::that(same(from_memory(pair), Filter(model)(pair)), "a model in memory, on two threads, answers the same");
 }
 
-void embedded_model_is_the_file(const Model& model, const MatchPair& pair) {
-    check::equal(mgca::has_embedded_model(), MGCA_TEST_EMBEDDED != 0, "whether a model is embedded");
+void embedded_models_are_the_files(const Model& model, const MatchPair& pair) {
+    check::equal(mgca::has_embedded_model(), MGCA_TEST_EMBEDDED != 0, "whether models are embedded");
     if (mgca::has_embedded_model()) {
-        check::that(same(Filter(mgca::embedded_model())(pair), Filter(model)(pair)), "the embedded model is the same");
-        check::equal(mgca::embedded_model().version(), model.version(), "version of the embedded model");
+        check::that(same(Filter(mgca::embedded_model())(pair), Filter(model)(pair)), "the embedded models are the same");
+        check::equal(mgca::embedded_model().sha256(), model.sha256(), "digests of the embedded models");
         mgca::RuntimeOptions runtime;
         runtime.threads = -1;
         check::throws<ArgumentError>([&] { mgca::embedded_model(runtime); }, "threads");
     } else {
         check::throws<ModelError>([] { mgca::embedded_model(); }, "MGCA_EMBED_MODEL");
     }
+}
+
+using Names = std::vector<std::string>;
+
+/// A quick network, and a deeper one where that settles nothing.
+void a_first_look_may_be_enough(const Model& deep, const Model& quick, const std::filesystem::path& golden) {
+    const Model both = deep.with_first_look(quick);
+    check::equal(both.name(), quick.name() + " + " + deep.name(), "names in the order of asking");
+    check::equal(both.version(), quick.version() + " + " + deep.version(), "versions likewise");
+    check::equal(both.sha256(), quick.sha256() + " + " + deep.sha256(), "digests likewise");
+    check::throws<ArgumentError>([&] { both.with_first_look(quick); }, "one file each, got " + both.name());
+    check::throws<ArgumentError>([&] { deep.with_first_look(both); }, "one file each, got " + both.name());
+
+    const auto asked = [&](const Model& model, const char* input, auto change) {
+        Options options;
+        change(options);
+        return Filter(model, options)(golden::read_input(golden, input));
+    };
+    const auto as_it_is = [](Options&) {};
+    const auto full = [](Options& o) { o.effort = mgca::Effort::full; };
+    const Names first{quick.name()}, all{quick.name(), deep.name()};
+    const Result easy = asked(both, "general", as_it_is), settled = asked(both, "wide", as_it_is);
+    check::that(easy.ok() && easy.networks.empty() && easy.num_network_matches == 0, "an easy pair asks no network");
+    check::that(settled.ok() && settled.networks == first, "a first look that settles the pair is the only one");
+    check::that(same(settled, asked(quick, "wide", as_it_is)), "and its answer is that of the quick network alone");
+    check::equal(settled.ended, std::string("first sources"), "which ended with the first sources");
+    const Result faint = asked(both, "faint_13", as_it_is), sought = asked(both, "wide", full);
+    check::that(faint.networks == all, "a first look that settles nothing asks the deep network as well");
+    check::that(sought.networks == all && asked(both, "general", full).networks == all, "effort is felt");
+    check::that(asked(both, "wide", [](Options& o) { o.method = mgca::Method::magsac; }).networks == all, "one method");
+    check::that(asked(both, "wide", [](Options& o) { o.method = mgca::Method::none; }).networks == all, "none");
+    check::that(asked(both, "wide", [](Options& o) { o.geometry = mgca::Geometry::homography; }).networks == all,
+                "a homography");
+    check::that(asked(both, "guessed_by_extent", as_it_is).networks == all, "without intrinsics");
+    check::that(asked(both, "empty", as_it_is).networks == all, "no matches");
+
+    // A file alone is asked alone; of both the logits are the mean, on what both saw.
+    for (const Model& model : {quick, deep}) {
+        check::that(asked(model, "wide", full).networks == Names{model.name()}, "one file, one network");
+    }
+    const Result one = asked(quick, "wide", full), other = asked(deep, "wide", full);
+    int means = 0, kept = 0;
+    for (std::size_t i = 0; i < sought.scores.size(); ++i) {
+        const float low = std::min(one.scores[i], other.scores[i]), high = std::max(one.scores[i], other.scores[i]);
+        means += sought.scores[i] >= low && sought.scores[i] <= high ? 1 : 0;
+        kept += sought.scores[i] == one.scores[i] ? 1 : 0;
+    }
+    check::that(kept > 0, "what is hopeless is not sent to the deep network");
+    check::that(means > static_cast<int>(0.9 * static_cast<double>(sought.scores.size())), "scores lie between");
+    check::equal(sought.num_network_matches, one.num_network_matches, "matches that the first network saw");
 }
 
 /// What mgca.h says of a pair is what filter.hpp says.
@@ -397,25 +447,27 @@ void words_are_read() {
 }  // namespace
 
 int main(int argc, char** argv) {
-    if (argc != 3) {
-        std::cerr << "usage: test_interface GOLDEN_FOLDER MODEL\n";
+    if (argc != 4) {
+        std::cerr << "usage: test_interface GOLDEN_FOLDER MODEL FIRST_LOOK\n";
         return 2;
     }
     const std::filesystem::path golden = argv[1], file = argv[2];
-    const Model model = Model::from_file(file);
+    const Model deep = Model::from_file(file), quick = Model::from_file(argv[3]);
+    const Model model = deep.with_first_look(quick);
     const MatchPair pair = golden::read_input(golden, "wide");
     options_are_checked(model);
     model_files_are_checked(file);
     models_are_named(model);
-    sums_are_checked(file, model);
+    sums_are_checked(file, deep);
     inputs_are_checked(model, golden::read_input(golden, "general"));
     data_never_throws(model);
     options_are_felt(model, pair);
     cameras_are_felt(model, pair);
     threads_share_a_filter(model, pair);
-    memory_and_file_agree(file, model, pair);
-    embedded_model_is_the_file(model, pair);
-    c_agrees(file, model, pair);
+    memory_and_file_agree(file, deep, pair);
+    a_first_look_may_be_enough(deep, quick, golden);
+    embedded_models_are_the_files(MGCA_TEST_EMBEDDED == 1 ? deep : model, pair);
+    c_agrees(file, deep, pair);
     two_cameras_have_two_focal_lengths(model, golden::read_input(golden, "two_focal_lengths"));
     a_mirrored_image_is_told(model, golden::read_input(golden, "mirrored_plane"));
     words_are_read();

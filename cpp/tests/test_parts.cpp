@@ -16,6 +16,7 @@
 #include "mirror.hpp"
 #include "pose_refinement.hpp"
 #include "robust_fit.hpp"
+#include "scoring.hpp"
 #include "sha256.hpp"
 
 #include <algorithm>
@@ -431,6 +432,35 @@ void probabilities_and_logits_are_inverse() {
                 "best of the list");
 }
 
+void networks_are_heard_alike() {
+    ModelMetadata metadata;
+    metadata.calibration = {2.0, 1.0};
+    metadata.decision_threshold = 0.5;
+    const Opinion first = Opinion::of({4.0F, -2.0F, -8.0F}, metadata);
+    check::that(first.margins == std::vector<float>{3.5F, -2.5F, -8.5F}, "margins");
+    check::that(first.log_odds == std::vector<float>{9.0F, -3.0F, -15.0F}, "log-odds");
+    check::near(sigmoid(first.log_odds[1]), metadata.calibration.probability(-2.0F), 0.0, "scores are the odds'");
+    const Opinion second = Opinion::of({1.0F, 1.0F, 1.0F}, metadata), third = Opinion::of({4.0F, 7.0F, 1.0F}, metadata);
+    const Opinion two = first.joined(second, {0, 1}), three = two.joined(third, {0, 1});
+    check::that(two.log_odds == std::vector<float>{6.0F, 0.0F, -15.0F}, "the mean, where both saw the match");
+    check::that(two.margins == std::vector<float>{2.0F, -1.0F, -8.5F} && two.networks == 2, "of the margins likewise");
+    check::that(three.log_odds == std::vector<float>{7.0F, 5.0F, -15.0F}, "a third counts a third");
+
+    Opinion opinion;
+    Rows rows;
+    for (std::size_t i = 0; i < 300; ++i) {
+        opinion.log_odds.push_back(i < 200 && i % 2 == 0 ? 1.0F : -9.0F - static_cast<float>(i) * 1e-2F);
+        rows.push_back(i);
+    }
+    const Rows likely = opinion.undecided(rows), few = opinion.undecided(Rows(rows.begin() + 150, rows.end()));
+    check::that(likely.size() == 100 && std::all_of(likely.begin(), likely.end(),
+                                                    [](std::size_t i) { return i < 200 && i % 2 == 0; }),
+                "what is hopeless is left out");
+    check::that(few.size() == kFewestUndecided && few.front() == 150 && std::is_sorted(few.begin(), few.end()),
+                "of few likely ones the best are taken in any case");
+    check::that(opinion.undecided({7, 9}) == Rows({7, 9}) && opinion.undecided({}).empty(), "or all");
+}
+
 void guessed_and_seeded_estimators_answer() {
     Correspondences matches = draw_matches(kPose, 120, 0.2, 13);
     for (const Estimator method : {Estimator::prosac, Estimator::magsac, Estimator::ransac}) {
@@ -472,6 +502,7 @@ int main() {
     the_likelier_hypothesis_is_chosen();
     residuals_become_scores();
     probabilities_and_logits_are_inverse();
+    networks_are_heard_alike();
     guessed_and_seeded_estimators_answer();
     return check::result("parts");
 }

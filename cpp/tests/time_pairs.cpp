@@ -1,6 +1,6 @@
 // Times the filter for benchmarks/cpp_speed.py: pairs from a file, one answer for each line on standard input.
 //
-//     time_pairs MODEL PAIRS
+//     time_pairs MODEL FIRST_LOOK PAIRS
 //
 // PAIRS holds, for each pair: the numbers of keypoints 1, keypoints 2 and rows; fx, fy, cx, cy, or zeros without intrinsics;
 // x, y, size and angle of each keypoint; first and second candidate of each row: index in image 2 and distance, the index -1
@@ -69,17 +69,17 @@ std::vector<Pair> read_pairs(const char* file) {
 }  // namespace
 
 int main(int argc, char** argv) {
-    if (argc != 3) {
-        std::cerr << "usage: time_pairs MODEL PAIRS\n";
+    if (argc != 4) {
+        std::cerr << "usage: time_pairs MODEL FIRST_LOOK PAIRS\n";
         return 2;
     }
     try {
         cv::setNumThreads(1);
-        const mgca::Model model = mgca::Model::from_file(argv[1]);
+        const mgca::Model model = mgca::Model::from_file(argv[1]).with_first_look(mgca::Model::from_file(argv[2]));
         mgca::Options full;
         full.effort = mgca::Effort::full;
         const mgca::Filter filters[] = {mgca::Filter(model), mgca::Filter(model, full)};
-        const std::vector<Pair> pairs = read_pairs(argv[2]);
+        const std::vector<Pair> pairs = read_pairs(argv[3]);
         std::cout << mgca::Model::runtime() << ", OpenCV " << CV_VERSION << std::endl;
         std::size_t index = 0, effort = 0;
         while (std::cin >> index >> effort) {

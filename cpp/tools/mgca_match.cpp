@@ -28,8 +28,9 @@ namespace {
 constexpr int kFound = 0, kNothingFound = 1, kError = 2;
 
 constexpr const char* kHelp =
-    "usage: mgca_match IMAGE1 IMAGE2 [--model FILE] [options]\n"
-    "  --model FILE            ONNX file of mgca_filter (default: the model within the library, where it has one)\n"
+    "usage: mgca_match IMAGE1 IMAGE2 [--model FILE [--first-look FILE]] [options]\n"
+    "  --model FILE            ONNX file of mgca_filter (default: both models within the library, where it has them)\n"
+    "  --first-look FILE       a quicker one, asked before it: mgca_fast.onnx before mgca_small.onnx is the default\n"
     "  --K, --K2 fx,fy,cx,cy   intrinsics in pixels; without --K2 both images share them, without both they are guessed\n"
     "  --dist, --dist2 k1,k2,p1,p2[,...]  distortion coefficients of OpenCV\n"
     "  --threshold PX          inlier threshold of the mask (default 1)\n"
@@ -45,7 +46,7 @@ constexpr const char* kHelp =
 
 struct Arguments {
     std::vector<std::string> images;
-    std::string model;
+    std::string model, first_look;
     mgca::Camera camera1, camera2;
     mgca::Options options;
     mgca::RuntimeOptions runtime;
@@ -95,6 +96,8 @@ cv::Matx33d intrinsics(const std::string& text, const std::string& option) {
 void set_option(Arguments& arguments, const std::string& name, const std::string& value) {
     if (name == "--model") {
         arguments.model = value;
+    } else if (name == "--first-look") {
+        arguments.first_look = value;
     } else if (name == "--K") {
         arguments.camera1.K = intrinsics(value, name);
     } else if (name == "--K2") {
@@ -144,6 +147,9 @@ Arguments parse_arguments(const std::vector<std::string>& words) {
     }
     if (arguments.images.size() != 2) {
         throw std::invalid_argument("expected two images");
+    }
+    if (arguments.model.empty() && !arguments.first_look.empty()) {
+        throw std::invalid_argument("--first-look: needs --model");
     }
     if (arguments.model.empty() && !mgca::has_embedded_model()) {
         throw std::invalid_argument("expected --model: the library was built without a model in it");
@@ -247,10 +253,18 @@ void print_words(std::ostream& out, const mgca::Result& result, double milliseco
     out << "filter      " << milliseconds << " ms\n";
 }
 
+mgca::Model open_model(const Arguments& arguments) {
+    if (arguments.model.empty()) {
+        return mgca::embedded_model(arguments.runtime);
+    }
+    const mgca::Model model = mgca::Model::from_file(arguments.model, arguments.runtime);
+    return arguments.first_look.empty()
+               ? model
+               : model.with_first_look(mgca::Model::from_file(arguments.first_look, arguments.runtime));
+}
+
 int run(Arguments arguments) {
-    const mgca::Model model = arguments.model.empty() ? mgca::embedded_model(arguments.runtime)
-                                                      : mgca::Model::from_file(arguments.model, arguments.runtime);
-    const mgca::Filter filter(model, arguments.options);
+    const mgca::Filter filter(open_model(arguments), arguments.options);
     std::vector<cv::KeyPoint> keypoints1, keypoints2;
     const cv::Mat descriptors1 =
         detect(arguments.images[0], arguments.max_keypoints, keypoints1, arguments.camera1.size);

@@ -4,7 +4,8 @@
 
 Every file of a program includes it; one defines ``MGCA_IMPLEMENTATION`` before. That one needs OpenCV's ``core`` and
 ``calib3d`` (of OpenCV 5 ``core`` and ``geometry``) and ONNX Runtime; with ``MGCA_OPENCV_DNN`` defined, OpenCV 5's
-``dnn`` in its place. ``MGCA_EMBEDDED_FILE`` may name a model file, as a string, that becomes the embedded one.
+``dnn`` in its place. ``MGCA_EMBEDDED_FILE`` may name a model file, as a string, that becomes the embedded one,
+``MGCA_EMBEDDED_FIRST_LOOK_FILE`` a quicker one that is asked before it.
 """
 
 from __future__ import annotations

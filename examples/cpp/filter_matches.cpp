@@ -4,9 +4,12 @@
 
 #include <iostream>
 
+/// filter_matches [MODEL [FIRST_LOOK]]
 int main(int argc, char** argv) {
-    // Without a file: the model within the library, where it was built with one.
-    const mgca::Filter filter(argc > 1 ? mgca::Model::from_file(argv[1]) : mgca::embedded_model());
+    // Two networks are the default: a quick one, and a deeper one where that does not settle the pair. Without files those
+    // within the library, where it was built with them; one file alone is possible.
+    const mgca::Model model = argc > 1 ? mgca::Model::from_file(argv[1]) : mgca::embedded_model();
+    const mgca::Filter filter(argc > 2 ? model.with_first_look(mgca::Model::from_file(argv[2])) : model);
 
     // In a program of one's own these come from a detector and a matcher.
     std::vector<cv::Point2f> points1, points2;

@@ -1,10 +1,11 @@
 // Frame-to-frame motion of a folder of images, and how long each step takes.
 //
-//     odometry FOLDER fx,fy,cx,cy [orb|flow] [MODEL]
+//     odometry FOLDER fx,fy,cx,cy [orb|flow] [MODEL [FIRST_LOOK]]
 //
 // orb matches ORB features, flow follows corners by optical flow from image to image. Every frame is compared with the last
 // keyframe, which gives way where the images have moved far enough apart: between neighbours of a video the baseline is too
-// short to tell a direction. Without MODEL the model within the library is taken.
+// short to tell a direction. Without MODEL the two models within the library are taken; MODEL alone is asked
+// alone, which takes longer or is a little less accurate; FIRST_LOOK is a quicker one that is asked before it.
 
 #include <mgca/filter.hpp>
 
@@ -192,9 +193,9 @@ int run(const std::string& folder, const cv::Matx33d& K, FrontEnd& front_end, co
 int main(int argc, char** argv) {
     double fx = 0.0, fy = 0.0, cx = 0.0, cy = 0.0;
     const std::string source = argc > 3 ? argv[3] : "orb";
-    if (argc < 3 || argc > 5 || std::sscanf(argv[2], "%lf,%lf,%lf,%lf", &fx, &fy, &cx, &cy) != 4 ||
+    if (argc < 3 || argc > 6 || std::sscanf(argv[2], "%lf,%lf,%lf,%lf", &fx, &fy, &cx, &cy) != 4 ||
         (source != "orb" && source != "flow")) {
-        std::cerr << "usage: odometry FOLDER fx,fy,cx,cy [orb|flow] [MODEL]\n";
+        std::cerr << "usage: odometry FOLDER fx,fy,cx,cy [orb|flow] [MODEL [FIRST_LOOK]]\n";
         return 2;
     }
     try {
@@ -204,7 +205,8 @@ int main(int argc, char** argv) {
         } else {
             front_end = std::make_unique<OrbFrontEnd>();
         }
-        const mgca::Filter filter(argc > 4 ? mgca::Model::from_file(argv[4]) : mgca::embedded_model());
+        const mgca::Model model = argc > 4 ? mgca::Model::from_file(argv[4]) : mgca::embedded_model();
+        const mgca::Filter filter(argc > 5 ? model.with_first_look(mgca::Model::from_file(argv[5])) : model);
         return run(argv[1], {fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0}, *front_end, filter);
     } catch (const std::exception& error) {
         std::cerr << "odometry: " << error.what() << "\n";

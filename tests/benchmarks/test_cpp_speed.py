@@ -17,7 +17,7 @@ from benchmarks.fill_docs import cpp
 PROGRAM = """#!{python}
 import sys
 print("Runtime 1, OpenCV 9", flush=True)
-words = open(sys.argv[2]).read().split()
+words = open(sys.argv[3]).read().split()
 for line in sys.stdin:
     index, full = map(int, line.split())
     print(2.0 + full, "ok" if index == 0 else "planar", 7, flush=True)

@@ -162,6 +162,7 @@ def describe(result: FilterResult) -> dict[str, Any]:
         "origin": result.info["origin"],
         "ended": result.info["ended"],
         "num_network_matches": result.info["num_network_matches"],
+        "networks": result.info["networks"],
         "intrinsics": result.info["intrinsics"],
         "assumptions": result.info["assumptions"],
         "support": result.info.get("support"),

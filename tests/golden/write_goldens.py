@@ -37,8 +37,9 @@ WRONG = np.array([[420.0, 0.0, 319.5], [0.0, 420.0, 239.5], [0.0, 0.0, 1.0]])
 # Numbers of right matches among 300 wrong ones from which the filter begins to believe.
 FAINT = (6, 13, 16)
 FISHEYE = [-0.02, 0.004, -0.001, 0.0002]
-# Cases that the last digits decide, which no seed shows: on a plane the focal length is not determined.
-FRAGILE = {"planar_guessed"}
+# Cases that the last digits decide, which no seed shows: on a plane the focal length is not determined; so few right
+# matches have a confidence at the limit, which another version of OpenCV does not reach.
+FRAGILE = {"planar_guessed", "faint_16"}
 WIDE_LENS = [-0.28, 0.09, 0.0008, -0.0005, -0.01]
 
 

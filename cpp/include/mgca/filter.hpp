@@ -1,12 +1,16 @@
 // Tells right feature matches from wrong ones and estimates the two-view geometry.
 //
-//     const mgca::Filter filter(mgca::embedded_model());  // or mgca::Model::from_file("mgca_small.onnx")
+//     const mgca::Filter filter(mgca::embedded_model());
 //     const mgca::Result result = filter(keypoints1, keypoints2, knn_matches, K);
 //     if (result.ok()) use(*result.R, *result.t);
 //
+// embedded_model() holds two networks: a quick one is asked first, a deeper one where that does not settle the pair. From
+// files that is Model::from_file("mgca_small.onnx").with_first_look(Model::from_file("mgca_fast.onnx")). One file alone is
+// possible: then pairs that need a network take longer (mgca_small), or are answered a little less accurately (mgca_fast).
+//
 // The only header of the library; it needs C++17 and OpenCV's core. Conventions: pixels follow OpenCV (the centre of the
 // top-left pixel is (0, 0)), X2 = R X1 + t, x2^T E x1 = 0 on the normalised image planes, p2^T F p1 = 0 and p2 ~ H p1 in
-// pixels. The library gives the answers of the Python package `mgca_filter` on the same model file.
+// pixels. The library gives the answers of the Python package `mgca_filter` on the same model files.
 
 #pragma once
 
@@ -74,7 +78,7 @@ MGCA_API const char* to_string(Status status) noexcept;
 /// leaves scores and a mask by score.
 enum class Method { automatic, prosac, magsac, ransac, none };
 
-/// Automatic leaves the network out where a run on the list alone explains it; full always runs it.
+/// Automatic leaves the networks out where a run on the list alone explains it; full always runs them all.
 enum class Effort { automatic, full };
 
 /// Automatic: an essential matrix where intrinsics are given, else a fundamental matrix, and a homography beside or
@@ -100,7 +104,7 @@ struct Options {
     std::optional<double> keep_precision;  ///< Instead of a threshold: expected precision of the mask, in (0, 1).
     double confidence = 0.999;             ///< Of the robust fit, in (0, 1).
     Method method = Method::automatic;     ///< Robust fit.
-    Effort effort = Effort::automatic;     ///< Whether easy pairs may go without the network.
+    Effort effort = Effort::automatic;     ///< Whether easy pairs may go without the networks.
     Geometry geometry = Geometry::automatic;  ///< Model that is asked for.
     int max_iterations = 5000;             ///< Largest number of samples that one run of an estimator draws.
     int seed = 0;                          ///< Of every random choice, not negative; same seed, same answer.
@@ -118,7 +122,7 @@ struct RuntimeOptions {
     std::map<std::string, std::map<std::string, std::string>> provider_options;
 };
 
-/// An open model file. Cheap to copy: copies share one session. Safe to use from several threads.
+/// One or two open model files, the deepest network last. Cheap to copy: copies share the sessions. Safe to use from several threads.
 class MGCA_API Model {
 public:
     /// Open an ONNX file of mgca_filter. Throws ModelError, also where the SHA256SUMS beside it lists another file of this
@@ -128,13 +132,17 @@ public:
     /// The same from bytes, which need not outlive the call.
     static Model from_memory(const void* data, std::size_t size, const RuntimeOptions& options = {});
 
-    /// Name of the model, as its file says.
+    /// A model that asks the network of another file, a quicker one, first, and this one where that does not settle the pair.
+    /// Throws ArgumentError where either holds two already.
+    Model with_first_look(const Model& quick) const;
+
+    /// Name of the model, as its file says; of two "mgca_fast + mgca_small", in the order in which they are asked.
     const std::string& name() const noexcept;
 
-    /// Version of the model, as its file says.
+    /// Version of the model, as its file says; of two likewise.
     const std::string& version() const noexcept;
 
-    /// SHA-256 of the model file, hexadecimal.
+    /// SHA-256 of the model file, hexadecimal; of two likewise.
     const std::string& sha256() const noexcept;
 
     /// Sentences on what turned out otherwise than asked for: another provider.
@@ -152,10 +160,10 @@ private:
     std::shared_ptr<const State> state_;
 };
 
-/// The library was built with a model in it (MGCA_EMBED_MODEL).
+/// The library was built with models in it (MGCA_EMBED_MODEL).
 MGCA_API bool has_embedded_model() noexcept;
 
-/// Open the model that is within the library; throws ModelError where it was built without one, or RuntimeError.
+/// Open the models that are within the library, the quick one as the first look; throws ModelError where it was built without one, or RuntimeError.
 MGCA_API Model embedded_model(const RuntimeOptions& options = {});
 
 /// Keypoints of one image; converts from what OpenCV programs hold.
@@ -250,9 +258,10 @@ struct Result {
     bool focal_doubt = false;
     std::vector<std::string> assumptions;       ///< Sentences on what was assumed.
     int num_accepted = 0;                       ///< Matches whose logit is above the model's decision threshold.
-    std::optional<cv::Matx33d> network_essential;  ///< Essential matrix as the network gave it.
+    std::optional<cv::Matx33d> network_essential;  ///< Essential matrix as the last of them gave it.
     std::optional<cv::Matx33d> fitted_essential;   ///< As the robust fit left it, before the verdict.
-    int num_network_matches = 0;                ///< Matches that entered the network; 0 where it was not needed.
+    int num_network_matches = 0;                ///< Matches that entered the first network; 0 where none was needed.
+    std::vector<std::string> networks;          ///< Names of the networks that were asked, in that order; perhaps none.
     std::string origin;                         ///< Source that proposed the model: "list", "network", "accepted", ...
     std::string ended;                          ///< "before the network", "first sources" or "all sources".
     std::optional<int> support;                 ///< Accepted matches that agree with the model.

@@ -72,7 +72,8 @@ MGCA_C_API const char *mgca_status_word(int status);
 
 /* Models ----------------------------------------------------------------------------------------------------------- */
 
-/* Open an ONNX file of mgca_filter; NULL = the model within the library, where it was built with one.
+/* Open an ONNX file of mgca_filter; NULL = the models within the library, where it was built with them: a quick network,
+ * which is asked first, and a deeper one for the pairs that it does not settle.
  * threads: of one forward pass, 0 = as many as there are cores. providers: execution providers of ONNX Runtime, the
  * preferred first, separated by commas; NULL = CPU. One that is missing or cannot start gives way to the CPU, with a note. */
 MGCA_C_API int mgca_model_open(const char *file, int threads, const char *providers, mgca_model **model);
@@ -81,6 +82,12 @@ MGCA_C_API int mgca_model_open(const char *file, int threads, const char *provid
 MGCA_C_API int mgca_model_open_memory(const void *data, size_t size, int threads, const char *providers,
                                       mgca_model **model);
 
+/* A model that asks the network of another one, a quicker one, first, and its own where that does not settle the pair.
+ * Either holds one file; both may be closed. One file alone is possible: then pairs that need a network take longer
+ * (mgca_small), or are answered a little less accurately (mgca_fast). */
+MGCA_C_API int mgca_model_with_first_look(const mgca_model *model, const mgca_model *first_look, mgca_model **both);
+
+/* What the file says of itself, and its digest; of two "mgca_fast + mgca_small", in the order in which they are asked. */
 MGCA_C_API const char *mgca_model_name(const mgca_model *model);
 MGCA_C_API const char *mgca_model_version(const mgca_model *model);
 MGCA_C_API const char *mgca_model_sha256(const mgca_model *model);
@@ -177,6 +184,9 @@ MGCA_C_API double mgca_result_number(const mgca_result *result, const char *name
 
 /* "intrinsics" ("given", "estimated" or "guessed"), "origin" or "ended"; NULL for another name. */
 MGCA_C_API const char *mgca_result_word(const mgca_result *result, const char *name);
+
+/* Name of a network that was asked, from index 0 on, in that order; NULL behind the last. */
+MGCA_C_API const char *mgca_result_network(const mgca_result *result, size_t index);
 
 /* A sentence on what was assumed, from index 0 on; NULL behind the last. */
 MGCA_C_API const char *mgca_result_assumption(const mgca_result *result, size_t index);
