@@ -127,7 +127,8 @@ private:
     void ask_networks() {
         rows_ = detail::select_network_input(pair_, networks_.front()->metadata, options_.seed);
         detail::Rows sent = rows_;
-        for (const auto& one : networks_) {
+        for (std::size_t i = 0; i < networks_.size(); ++i) {
+            const auto& one = networks_[i];
             const auto output = detail::run_network(*one->network, pair_, sent);
             if (output) {
                 result_.network_essential = output->essential;
@@ -136,7 +137,7 @@ private:
             const auto opinion =
                 detail::Opinion::of(detail::assemble_logits(pair_, sent, output, one->metadata), one->metadata);
             opinion_ = opinion_ ? opinion_->joined(opinion, sent) : opinion;
-            const bool last = one == networks_.back();
+            const bool last = i + 1 == networks_.size();
             if (last || options_.effort == Effort::automatic) {
                 fit(last);
             }

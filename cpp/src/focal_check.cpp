@@ -105,8 +105,14 @@ Trial descend(const Correspondences& rows, Trial trial, double step, double thre
 }  // namespace
 
 std::optional<double> better_focal_factor(const Correspondences& matches, const Pose& pose, double threshold) {
-    const auto end = matches.begin() + static_cast<std::ptrdiff_t>(std::min(matches.size(), kMaxRows));
-    const Correspondences rows(matches.begin(), end);
+    // What lies beyond the coarsest reach is wrong under every focal length, and says nothing of any.
+    Correspondences rows;
+    const cv::Matx33d found = unscaled_essential(pose);
+    for (std::size_t i = 0; i < matches.size() && rows.size() < kMaxRows; ++i) {
+        if (sampson_distance(matches[i], found) < kCoarseFactor * threshold) {
+            rows.push_back(matches[i]);
+        }
+    }
     const Trial given = refined(rows, 1.0, pose, threshold);
     const cv::Matx33d E = unscaled_essential(given.pose);
     Correspondences near;

@@ -72,7 +72,9 @@ def better_focal_factor(correspondences: Array, R: Array, t: Array, threshold: f
     Returns:
         A power of 1.2, rough by that much, between 0.23 and 4.3.
     """
-    rows = correspondences[:_MAX_ROWS]
+    # What lies beyond the coarsest reach is wrong under every focal length, and says nothing of any.
+    within = sampson_distance(correspondences, cross_matrix(t) @ R) < COARSE_FACTOR * threshold
+    rows = correspondences[within][:_MAX_ROWS]
     start = _promise(rows, R, t, threshold)
     if start is not None and start.worth < CLEAR_WORTH:
         return None
