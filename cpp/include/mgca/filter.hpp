@@ -122,7 +122,8 @@ struct RuntimeOptions {
     std::map<std::string, std::map<std::string, std::string>> provider_options;
 };
 
-/// One or two open model files, the deepest network last. Cheap to copy: copies share the sessions. Safe to use from several threads.
+/// One or two open model files, the deepest network last. Cheap to copy: copies share the sessions. Safe to use from
+/// several threads.
 class MGCA_API Model {
 public:
     /// Open an ONNX file of mgca_filter. Throws ModelError, also where the SHA256SUMS beside it lists another file of this
@@ -163,7 +164,8 @@ private:
 /// The library was built with models in it (MGCA_EMBED_MODEL).
 MGCA_API bool has_embedded_model() noexcept;
 
-/// Open the models that are within the library, the quick one as the first look; throws ModelError where it was built without one, or RuntimeError.
+/// Open the models that are within the library, the quick one as the first look; throws ModelError where it was built
+/// without one, or RuntimeError.
 MGCA_API Model embedded_model(const RuntimeOptions& options = {});
 
 /// Keypoints of one image; converts from what OpenCV programs hold.
