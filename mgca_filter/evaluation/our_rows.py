@@ -24,7 +24,7 @@ VARIANTS = {
     "product": "filter_matches, default options, with attributes, intrinsics and image sizes",
     "product poselib": "the same with method='poselib'",
     "product bare": "the same as product without attributes: positions only",
-    "network E": "recoverPose on the network's essential matrix with the 10 % best-scored matches, no RANSAC",
+    "network E": "recoverPose on the deep network's essential matrix with the 10 % best-scored matches, no RANSAC",
     "network RANSAC": "findEssentialMat(RANSAC, 1e-3 normalised) on the matches of logit > 0, the papers' protocol",
 }
 """Names of the rows and what they run."""
@@ -64,7 +64,7 @@ class ProductMethod:
             "revision": REVISION,
             "variant": self.variant,
             "selection": self.selection.settings(),
-            **model_settings(self.model, self._options(seed=0)),
+            **model_settings(self._model, self._options(seed=0)),
         }
         if self.variant == "product poselib":
             import poselib
@@ -75,7 +75,7 @@ class ProductMethod:
     def run(self, pair: ScenePair, seed: int) -> Answer:
         kept = self.selection.apply(pair)
         rows = np.flatnonzero(kept)
-        result = filter_pair(pair, rows, self.model, self._options(seed), bare=self.variant == "product bare")
+        result = filter_pair(pair, rows, self._model, self._options(seed), bare=self.variant == "product bare")
         logits = np.asarray(result.info["logits"], dtype=np.float64)
         verdict: dict[str, Any] = {}
         if self.variant.startswith("product"):
@@ -94,6 +94,11 @@ class ProductMethod:
         mask = np.zeros(len(kept), dtype=bool)
         mask[rows] = estimate.inliers
         return Answer(estimate.R, estimate.t, all_logits > 0, mask, estimate.failure, all_logits, scores, **verdict)
+
+    @property
+    def _model(self) -> str | None:
+        """What a row on a network's own answer asks is one network."""
+        return _deep_model(self.model) if self.variant.startswith("network") else self.model
 
     def _options(self, seed: int) -> dict[str, Any]:
         """What differs from the defaults of ``filter_matches``."""
@@ -124,11 +129,11 @@ class NetworkOrderMethod:
             "variant": NETWORK_ORDER,
             "selection": self.selection.settings(),
             "estimator": self.estimator.settings(),
-            **model_settings(self.model, {"method": "none"}),
+            **model_settings(_deep_model(self.model), {"method": "none"}),
         }
 
     def run(self, pair: ScenePair, seed: int) -> Answer:
-        result = filter_pair(pair, np.arange(len(pair.points1)), self.model, {"method": "none"})
+        result = filter_pair(pair, np.arange(len(pair.points1)), _deep_model(self.model), {"method": "none"})
         logits = np.asarray(result.info["logits"], dtype=np.float64)
         scores = np.asarray(result.scores, dtype=np.float64)
         kept = self.selection.apply(pair)
@@ -140,6 +145,13 @@ class NetworkOrderMethod:
         estimate = self.estimator.estimate(pair, rows, seed)
         mask[rows] = estimate.inliers
         return Answer(estimate.R, estimate.t, kept, mask, estimate.failure, logits, scores)
+
+
+def _deep_model(model: str | None) -> str:
+    """The model file whose network alone is asked."""
+    from ..match_filter import model_path
+
+    return str(model_path()) if model is None else model
 
 
 def filter_pair(
