@@ -234,8 +234,9 @@ class MatchFilter:
         pair, sent = job.pair, job.sent
         assert sent is not None
         job.asked.append(backend.metadata.name)
-        opinion = Opinion.of(assemble_logits(pair.attributes, pair.valid, sent, job.output, backend), backend.metadata)
-        job.opinion = opinion if job.opinion is None else job.opinion.joined(opinion, sent.rows)
+        if job.opinion is None:  # of what enters no network
+            job.opinion = Opinion.mean([self._opinion(pair, sent, None, other) for other in self._backends])
+        job.opinion = job.opinion.joined(self._opinion(pair, sent, job.output, backend), sent.rows)
         if last or self.options.effort == "auto":
             self._fit(job, last)
         job.sent = None if last or job.model is not None else sent[job.opinion.undecided(sent.rows)]
@@ -332,6 +333,10 @@ class MatchFilter:
             )
             _log.warning("%s", remarks[-1])
         return remarks
+
+    def _opinion(self, pair: PairInput, sent: NetworkInput, output: NetworkOutput | None, backend: Backend) -> Opinion:
+        """What one network says of all matches; its prior alone, where it has not run."""
+        return Opinion.of(assemble_logits(pair.attributes, pair.valid, sent, output, backend), backend.metadata)
 
     def _scores(self, job: _Job) -> NDArray[np.float32]:
         """Scores (M,) by the networks that were asked."""

@@ -54,7 +54,8 @@ def test_what_the_first_look_settles_needs_no_second(published: tuple[Backend, B
     assert result.info["networks"] == ["mgca_fast"]
     assert result.info["ended"] == "first sources"
     alone = run(CLEAR, published[0])
-    np.testing.assert_array_equal(result.scores, alone.scores)
+    seen = alone.info["network_rows"]
+    np.testing.assert_array_equal(result.scores[seen], alone.scores[seen])
     np.testing.assert_array_equal(result.mask, alone.mask)
     np.testing.assert_array_equal(result.E, alone.E)
 
@@ -85,6 +86,25 @@ def test_whoever_wants_all_networks_has_them(published: tuple[Backend, Backend],
 @pytest.mark.parametrize("geometry", ["fundamental", "homography"])
 def test_models_without_a_confidence_ask_all_networks(published: tuple[Backend, Backend], geometry: str) -> None:
     assert len(run(CLEAR, *published, geometry=geometry).info["networks"]) == 2
+
+
+def test_what_enters_no_network_has_the_mean_of_their_priors(published: tuple[Backend, Backend]) -> None:
+    scene = make_scene(right=60, wrong=240, seed=5)
+    ratio = np.where(scene.inlier, 0.7, np.linspace(0.5, 1.0, len(scene.inlier)))  # some are no candidates
+    match_filter = MatchFilter.over(*published)
+    attributes = replace(scene.attributes, ratio=ratio)
+
+    def logits(*backends: Backend) -> tuple[NDArray, NDArray]:
+        chosen = MatchFilter.over(*backends, options=replace(match_filter.options, effort="full"))
+        result = chosen.filter(scene.points1, scene.points2, None, K1=K, attributes=attributes)
+        outside = np.setdiff1d(np.arange(len(ratio)), result.info["network_rows"])
+        return outside, result.info["logits"][outside]
+
+    outside, together = logits(*published)
+    assert 10 < len(outside) < 100
+    apart = [logits(backend)[1] for backend in published]
+    assert np.abs(apart[0] - apart[1]).max() > 0.1
+    np.testing.assert_allclose(together, np.mean(apart, axis=0), atol=1e-6)
 
 
 def test_two_networks_that_agree_say_what_one_says(published: tuple[Backend, Backend]) -> None:

@@ -127,6 +127,11 @@ private:
     void ask_networks() {
         rows_ = detail::select_network_input(pair_, networks_.front()->metadata, options_.seed);
         detail::Rows sent = rows_;
+        std::vector<detail::Opinion> priors;  // of what enters no network
+        for (const auto& one : networks_) {
+            priors.push_back(opinion_of(sent, std::nullopt, one->metadata));
+        }
+        opinion_ = detail::Opinion::mean(priors);
         for (std::size_t i = 0; i < networks_.size(); ++i) {
             const auto& one = networks_[i];
             const auto output = detail::run_network(*one->network, pair_, sent);
@@ -134,9 +139,7 @@ private:
                 result_.network_essential = output->essential;
             }
             result_.networks.push_back(one->metadata.name);
-            const auto opinion =
-                detail::Opinion::of(detail::assemble_logits(pair_, sent, output, one->metadata), one->metadata);
-            opinion_ = opinion_ ? opinion_->joined(opinion, sent) : opinion;
+            opinion_ = opinion_->joined(opinion_of(sent, output, one->metadata), sent);
             const bool last = i + 1 == networks_.size();
             if (last || options_.effort == Effort::automatic) {
                 fit(last);
@@ -146,6 +149,12 @@ private:
             }
             sent = opinion_->undecided(sent);
         }
+    }
+
+    /// What one network says of all matches; its prior alone, where it has not run.
+    detail::Opinion opinion_of(const detail::Rows& sent, const std::optional<detail::NetworkOutput>& output,
+                               const detail::ModelMetadata& metadata) const {
+        return detail::Opinion::of(detail::assemble_logits(pair_, sent, output, metadata), metadata);
     }
 
     /// Scores by the networks that were asked.

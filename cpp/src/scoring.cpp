@@ -33,13 +33,28 @@ Opinion Opinion::of(const std::vector<float>& logits, const ModelMetadata& metad
     return opinion;
 }
 
+Opinion Opinion::mean(const std::vector<Opinion>& opinions) {
+    Opinion all = opinions.front();
+    all.networks = 0;
+    const auto count = static_cast<float>(opinions.size());
+    for (std::size_t i = 0; i < all.margins.size(); ++i) {
+        for (std::size_t k = 1; k < opinions.size(); ++k) {
+            all.margins[i] += opinions[k].margins[i];
+            all.log_odds[i] += opinions[k].log_odds[i];
+        }
+        all.margins[i] /= count;
+        all.log_odds[i] /= count;
+    }
+    return all;
+}
+
 Opinion Opinion::joined(const Opinion& other, const Rows& rows) const {
     Opinion all = *this;
     all.networks += other.networks;
     const auto share = static_cast<float>(static_cast<double>(other.networks) / all.networks);
     for (const std::size_t i : rows) {
-        all.margins[i] += (other.margins[i] - all.margins[i]) * share;
-        all.log_odds[i] += (other.log_odds[i] - all.log_odds[i]) * share;
+        all.margins[i] = (1.0F - share) * all.margins[i] + share * other.margins[i];
+        all.log_odds[i] = (1.0F - share) * all.log_odds[i] + share * other.log_odds[i];
     }
     return all;
 }

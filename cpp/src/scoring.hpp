@@ -28,6 +28,9 @@ struct Opinion {
     /// What one network says, whose logits these are.
     static Opinion of(const std::vector<float>& logits, const ModelMetadata& metadata);
 
+    /// What several say before any was asked: by their priors, say.
+    static Opinion mean(const std::vector<Opinion>& opinions);
+
     /// With what one more network says of the matches `rows` that it saw.
     Opinion joined(const Opinion& other, const Rows& rows) const;
 

@@ -73,12 +73,21 @@ class Opinion:
         with np.errstate(under="ignore"):
             return sigmoid(self.log_odds).astype(np.float32)
 
+    @classmethod
+    def mean(cls, opinions: Sequence[Opinion]) -> Opinion:
+        """What several say before any was asked: by their priors, say."""
+        margins, log_odds = (
+            np.mean([getattr(one, name) for one in opinions], axis=0) for name in ("margins", "log_odds")
+        )
+        return cls(margins, log_odds, networks=0)
+
     def joined(self, other: Opinion, rows: NDArray[np.intp]) -> Opinion:
         """With what one more network says of the matches ``rows`` (N,) that it saw."""
         networks = self.networks + other.networks
+        share = np.float32(other.networks / networks)
         margins, log_odds = self.margins.copy(), self.log_odds.copy()
         for mean, new in ((margins, other.margins), (log_odds, other.log_odds)):
-            mean[rows] += (new[rows] - mean[rows]) * np.float32(other.networks / networks)
+            mean[rows] = (1 - share) * mean[rows] + share * new[rows]
         return Opinion(margins, log_odds, networks)
 
     def undecided(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
