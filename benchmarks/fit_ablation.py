@@ -24,7 +24,7 @@ from mgca_filter.evaluation.metrics import (
     mean_over_scenes,
     paired_bootstrap_interval,
 )
-from mgca_filter.export.choice_fit import scored_evidence
+from mgca_filter.export.choice_fit import filters_as_asked, scored_evidence
 from mgca_filter.fit.evidence import Evidence, gather_before
 from mgca_filter.fit.robust_fit import PLAN, POSELIB, Plan, Search, TwoViewModel
 from mgca_filter.geometry.epipolar import pose_error_deg
@@ -151,8 +151,7 @@ def origin_table(models: Sequence[TwoViewModel | None], errors_deg: Sequence[flo
 
 def run(options: argparse.Namespace) -> int:
     """Print both tables."""
-    models_asked = ("fast", None) if options.model is None else (options.model,)
-    filters = [MatchFilter(model=model, effort="full") for model in models_asked]
+    filters = filters_as_asked(options.model)
     selections = drawn_pairs(options)
     errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in VARIANTS}
     ms: dict[str, list[float]] = {name: [] for name in VARIANTS}

@@ -134,7 +134,7 @@ def samples_of(
 
     Args:
         pair, pose, group: the list, its true pose, and the name that is kept out of one fold.
-        filters: of full effort, over the networks as they are asked: each over those before and one more.
+        filters: as :func:`filters_as_asked` gives them.
     """
     prepared = prepare_pair(pair)
     *looks, last = (scored_evidence(one, pair, prepared) for one in filters)
@@ -148,6 +148,12 @@ def samples_of(
         model = search.with_network(last) if settled is None else settled
         found.append(_sample(model, pose, group, early=False))
     return [sample for sample in found if sample is not None]
+
+
+def filters_as_asked(model: Path | None) -> list[MatchFilter]:
+    """Filters of full effort over the networks of a filter as they are asked: each over those before and one more."""
+    models = ("fast", None) if model is None else (model,)
+    return [MatchFilter(model=name, effort="full") for name in models]
 
 
 def scored_evidence(match_filter: MatchFilter, pair: MatchPair, prepared: PairInput) -> Evidence:
@@ -353,8 +359,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         samples = load_samples(options.samples)
     elif options.bundles:
         with one_thread():
-            models = ("fast", None) if options.model is None else (options.model,)
-            samples = collect(options, [MatchFilter(model=model, effort="full") for model in models])
+            samples = collect(options, filters_as_asked(options.model))
         if options.samples is not None:
             save_samples(options.samples, samples)
     if samples:
