@@ -32,7 +32,7 @@ from .inference.scoring import (
     NetworkInput,
     NetworkOutput,
     Opinion,
-    assemble_logits,
+    prior_logits,
     run_network,
     select_network_input,
 )
@@ -234,9 +234,10 @@ class MatchFilter:
         pair, sent = job.pair, job.sent
         assert sent is not None
         job.asked.append(backend.metadata.name)
-        if job.opinion is None:  # of what enters no network
-            job.opinion = Opinion.mean([self._opinion(pair, sent, None, other) for other in self._backends])
-        job.opinion = job.opinion.joined(self._opinion(pair, sent, job.output, backend), sent.rows)
+        if job.opinion is None:
+            job.opinion = self._prior_opinion(pair, sent)
+        if job.output is not None:
+            job.opinion = job.opinion.joined(Opinion.of(job.output.finite_logits, backend.metadata), sent.rows)
         if last or self.options.effort == "auto":
             self._fit(job, last)
         job.sent = None if last or job.model is not None else sent[job.opinion.undecided(sent.rows)]
@@ -334,9 +335,12 @@ class MatchFilter:
             _log.warning("%s", remarks[-1])
         return remarks
 
-    def _opinion(self, pair: PairInput, sent: NetworkInput, output: NetworkOutput | None, backend: Backend) -> Opinion:
-        """What one network says of all matches; its prior alone, where it has not run."""
-        return Opinion.of(assemble_logits(pair.attributes, pair.valid, sent, output, backend), backend.metadata)
+    def _prior_opinion(self, pair: PairInput, sent: NetworkInput) -> Opinion:
+        """The mean of the networks' priors, of the matches that enter none of them."""
+        unseen = pair.valid.copy()
+        unseen[sent.rows] = False
+        models = [backend.metadata for backend in self._backends]
+        return Opinion.mean([Opinion.of(prior_logits(pair.attributes, unseen, model), model) for model in models])
 
     def _scores(self, job: _Job) -> NDArray[np.float32]:
         """Scores (M,) by the networks that were asked."""

@@ -134,7 +134,10 @@ def test_opinions_are_means_over_those_who_saw() -> None:
     rng = np.random.default_rng(0)
     one, two, three = (Opinion(*rng.normal(size=(2, 50)).astype(np.float32)) for _ in range(3))
     some, fewer = np.arange(0, 50, 2), np.arange(0, 50, 4)
-    joined = one.joined(two, some).joined(three, fewer)
+    seen_by_two, seen_by_three = (
+        Opinion(other.margins[rows], other.log_odds[rows]) for other, rows in ((two, some), (three, fewer))
+    )
+    joined = one.joined(seen_by_two, some).joined(seen_by_three, fewer)
     for name in ("margins", "log_odds"):
         first, second, third = (getattr(opinion, name) for opinion in (one, two, three))
         expected = first.copy()

@@ -15,6 +15,10 @@ namespace {
 constexpr double kHomographyConfidence = 0.999;
 constexpr int kHomographyIterations = 1000;
 
+// A rough run: rounds of local optimisation, and the most that is asked of the probability of a clean sample.
+constexpr int kRoughLoIterations = 3;
+constexpr double kRoughConfidence = 0.95;
+
 // For F OpenCV's USAC_MAGSAC optimises on larger samples.
 constexpr int kMagsacFundamentalLoSample = 50;
 
@@ -115,6 +119,10 @@ std::optional<cv::Matx33d> fit_epipolar(const Correspondences& rows, double foca
             const Preset preset = options.method == Estimator::prosac ? Preset::prosac : Preset::magsac;
             cv::UsacParams params =
                 usac_params(preset, threshold, options.confidence, options.max_iterations, options.seed);
+            if (options.rough) {
+                params.loIterations = kRoughLoIterations;
+                params.confidence = std::min(options.confidence, kRoughConfidence);
+            }
             if (!calibrated && preset == Preset::magsac) {
                 params.loSampleSize = kMagsacFundamentalLoSample;
             }

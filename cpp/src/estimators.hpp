@@ -22,6 +22,7 @@ struct EstimatorOptions {
     double confidence = 0.9999;
     int max_iterations = 5000;
     int seed = 0;
+    bool rough = false;  // MAGSAC's model is refined afterwards, and need not be good
 };
 
 /// Essential (calibrated) or fundamental matrix of unit Frobenius norm, in normalised coordinates.

@@ -129,17 +129,18 @@ private:
         detail::Rows sent = rows_;
         std::vector<detail::Opinion> priors;  // of what enters no network
         for (const auto& one : networks_) {
-            priors.push_back(opinion_of(sent, std::nullopt, one->metadata));
+            priors.push_back(detail::Opinion::of(detail::prior_logits(pair_, sent, one->metadata), one->metadata));
         }
         opinion_ = detail::Opinion::mean(priors);
         for (std::size_t i = 0; i < networks_.size(); ++i) {
             const auto& one = networks_[i];
             const auto output = detail::run_network(*one->network, pair_, sent);
+            result_.networks.push_back(one->metadata.name);
             if (output) {
                 result_.network_essential = output->essential;
+                const auto heard = detail::Opinion::of(detail::finite_logits(*output), one->metadata);
+                opinion_ = opinion_->joined(heard, sent);
             }
-            result_.networks.push_back(one->metadata.name);
-            opinion_ = opinion_->joined(opinion_of(sent, output, one->metadata), sent);
             const bool last = i + 1 == networks_.size();
             if (last || options_.effort == Effort::automatic) {
                 fit(last);
@@ -149,12 +150,6 @@ private:
             }
             sent = opinion_->undecided(sent);
         }
-    }
-
-    /// What one network says of all matches; its prior alone, where it has not run.
-    detail::Opinion opinion_of(const detail::Rows& sent, const std::optional<detail::NetworkOutput>& output,
-                               const detail::ModelMetadata& metadata) const {
-        return detail::Opinion::of(detail::assemble_logits(pair_, sent, output, metadata), metadata);
     }
 
     /// Scores by the networks that were asked.

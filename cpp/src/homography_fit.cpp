@@ -35,11 +35,13 @@ constexpr double kLeastWeight = 0.2;
 constexpr double kWideFactor = 3.0;
 constexpr double kCauchySigmas = 1.25;
 constexpr int kPolishRounds = 6;
+// Matches farther than this many thresholds from a homography do not come near by polishing it.
+constexpr double kReach = 12.0;
 // Least squares.
 constexpr double kInitialDamping = 1e-6, kMaxDamping = 1e3, kConvergedDecrease = 1e-9;
 // Planes are seldom perfect: a match is off the plane beyond this multiple of the threshold. Once H is known, two matches
-// off the plane determine the fundamental matrix; the scene has depth where their log10 NFA is below the last.
-constexpr double kOffPlaneFactor = 2.0, kParallaxFreedom = 2.0, kParallaxLog10Nfa = -5.0;
+// off the plane determine the fundamental matrix.
+constexpr double kOffPlaneFactor = 2.0, kParallaxFreedom = 2.0;
 // Chance.
 constexpr std::size_t kChanceRows = 400, kSmallestChanceHead = 16;
 constexpr std::array<double, 3> kThresholdFactors{0.5, 1.0, 2.0};
@@ -586,6 +588,14 @@ cv::Matx33d polish_homography(const Correspondences& matches, const cv::Matx33d&
     for (const std::size_t i : distinct) {
         rows.push_back(matches[i]);
     }
+    const std::vector<double> distances = sampson_distances_to_homography(rows, H);
+    std::size_t kept = 0;
+    for (std::size_t i = 0; i < rows.size(); ++i) {
+        if (distances[i] < kReach * options.threshold) {
+            rows[kept++] = rows[i];
+        }
+    }
+    rows.resize(kept);
     const auto frame = rows.size() < kSampleSize ? std::nullopt : unit_frame(rows);
     if (!frame || !std::all_of(H.val, H.val + 9, [](double value) { return std::isfinite(value); })) {
         return H;
@@ -599,7 +609,8 @@ cv::Matx33d polish_homography(const Correspondences& matches, const cv::Matx33d&
     return scaled(frame->to_unit(1).inv() * search.polish(start) * frame->to_unit(0));
 }
 
-bool homography_explains(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F, double threshold) {
+double parallax_false_alarms(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F,
+                             double threshold) {
     const std::vector<double> to_plane = sampson_distances_to_homography(matches, H);
     Correspondences off;
     for (std::size_t i = 0; i < matches.size(); ++i) {
@@ -608,11 +619,11 @@ bool homography_explains(const Correspondences& matches, const cv::Matx33d& H, c
         }
     }
     if (static_cast<double>(off.size()) <= kParallaxFreedom) {
-        return true;
+        return kInfinity;
     }
     const Mask witnesses = independent(off, sampson_distances(off, F), threshold, 2.0 * threshold);
     const auto count = static_cast<std::size_t>(std::count(witnesses.begin(), witnesses.end(), 1));
-    return plane_log10_nfa(off.size(), count, chance_rate(off, F, threshold), kParallaxFreedom) > kParallaxLog10Nfa;
+    return plane_log10_nfa(off.size(), count, chance_rate(off, F, threshold), kParallaxFreedom);
 }
 
 PlaneSupport plane_support(const Correspondences& matches, const cv::Matx33d& H, double threshold) {

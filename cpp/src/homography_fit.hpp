@@ -32,11 +32,13 @@ std::optional<cv::Matx33d> estimate_homography(const Correspondences& matches, c
 /// @param matches finite, in the unit of H.
 cv::Matx33d polish_homography(const Correspondences& matches, const cv::Matx33d& H, const HomographyOptions& options);
 
-/// True where one homography explains the pair as well as the epipolar model does: the matches off the plane that agree
-/// with the model are no more than chance gathers.
+/// log10 of the number of false alarms of the matches off the plane that agree with the epipolar model: above
+/// kParallaxLog10Nfa they are no more than chance gathers, and the homography explains the pair as well as that does.
 ///
 /// @param matches in pixels, as F; the best first. threshold: Sampson distance of an inlier.
-bool homography_explains(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F, double threshold);
+double parallax_false_alarms(const Correspondences& matches, const cv::Matx33d& H, const cv::Matx33d& F,
+                             double threshold);
+constexpr double kParallaxLog10Nfa = -5.0;
 
 /// log10 of the number of homographies that chance would support as well, on matches in pixels, the best first.
 double homography_false_alarms(const Correspondences& matches, const cv::Matx33d& H, double threshold);

@@ -18,10 +18,11 @@ constexpr double kPromising = 0.3, kCertain = 0.7;
 // A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
 constexpr double kTwinShare = 0.5;
 
-constexpr Proposal kList{"list", Family::list_uniform, Source::listed, Estimator::magsac, 0.5, 300, 0};
-constexpr Proposal kListCoarse{"list, 1 px", Family::list_uniform, Source::listed, Estimator::magsac, 1.0, 300, 4};
+constexpr Proposal kList{"list", Family::list_uniform, Source::listed, Estimator::magsac, 0.5, 300, 0, 0.0, true};
+constexpr Proposal kListCoarse{
+    "list, 1 px", Family::list_uniform, Source::listed, Estimator::magsac, 1.0, 300, 4, 0.0, true};
 constexpr Proposal kNetwork{"network", Family::network, Source::network};
-constexpr Proposal kAccepted{"accepted", Family::accepted, Source::accepted, Estimator::magsac, 0.5, 300, 1};
+constexpr Proposal kAccepted{"accepted", Family::accepted, Source::accepted, Estimator::magsac, 0.5, 300, 1, 0.0, true};
 constexpr Proposal kScoreOrder{"score order", Family::score_order, Source::above, Estimator::prosac, 1.0, 1000, 0, -1.0};
 constexpr Proposal kListOrder{"list order", Family::list_ordered, Source::listed, Estimator::prosac, 0.5, 1000, 0};
 constexpr Proposal kScoreOrderAll{
@@ -176,6 +177,7 @@ std::vector<cv::Matx33d> Search::run(const Proposal& proposal) const {
     options.confidence = options_.confidence;
     options.max_iterations = std::min(proposal.iterations, options_.max_iterations);
     options.seed = static_cast<int>((static_cast<long long>(options_.seed) + proposal.number) % (1LL << 31));
+    options.rough = proposal.rough && evidence_.calibrated;
     return detail::propose(proposal, evidence_, options);
 }
 

@@ -52,9 +52,10 @@ Opinion Opinion::joined(const Opinion& other, const Rows& rows) const {
     Opinion all = *this;
     all.networks += other.networks;
     const auto share = static_cast<float>(static_cast<double>(other.networks) / all.networks);
-    for (const std::size_t i : rows) {
-        all.margins[i] = (1.0F - share) * all.margins[i] + share * other.margins[i];
-        all.log_odds[i] = (1.0F - share) * all.log_odds[i] + share * other.log_odds[i];
+    for (std::size_t k = 0; k < rows.size(); ++k) {
+        const std::size_t i = rows[k];
+        all.margins[i] = (1.0F - share) * all.margins[i] + share * other.margins[k];
+        all.log_odds[i] = (1.0F - share) * all.log_odds[i] + share * other.log_odds[k];
     }
     return all;
 }
@@ -113,19 +114,24 @@ std::optional<NetworkOutput> run_network(const Network& network, const PairInput
     return network.infer(correspondences, attributes);
 }
 
-std::vector<float> assemble_logits(const PairInput& pair, const Rows& sent, const std::optional<NetworkOutput>& output,
-                                   const ModelMetadata& metadata) {
+std::vector<float> prior_logits(const PairInput& pair, const Rows& sent, const ModelMetadata& metadata) {
     std::vector<float> logits(pair.valid.size(), kInvalidLogit);
+    Mask unseen(pair.valid.begin(), pair.valid.end());
+    for (const std::size_t i : sent) {
+        unseen[i] = 0;
+    }
     const double ceiling = metadata.decision_threshold - kRejectedMargin;
     for (std::size_t i = 0; i < logits.size(); ++i) {
-        if (pair.valid[i] != 0) {
+        if (unseen[i] != 0) {
             logits[i] = below(metadata.prior.logit(pair.attributes[i]), ceiling);
         }
     }
-    for (std::size_t k = 0; output && k < sent.size(); ++k) {
-        // Degenerate input (all points equal, say) may leave the network without a finite answer.
-        logits[sent[k]] = std::isfinite(output->logits[k]) ? output->logits[k] : kInvalidLogit;
-    }
+    return logits;
+}
+
+std::vector<float> finite_logits(const NetworkOutput& output) {
+    std::vector<float> logits = output.logits;
+    std::replace_if(logits.begin(), logits.end(), [](float logit) { return !std::isfinite(logit); }, kInvalidLogit);
     return logits;
 }
 

@@ -19,7 +19,7 @@ constexpr float kInvalidLogit = -100.0F;
 constexpr double kHopelessScore = 1e-3;
 constexpr std::size_t kFewestUndecided = 64;
 
-/// What the networks that were asked say of all matches of a pair, each as much as another.
+/// What the networks that were asked say of some matches, each as much as another.
 struct Opinion {
     std::vector<float> margins;   // logits above the decision threshold
     std::vector<float> log_odds;  // calibrated
@@ -31,7 +31,7 @@ struct Opinion {
     /// What several say before any was asked: by their priors, say.
     static Opinion mean(const std::vector<Opinion>& opinions);
 
-    /// With what one more network says of the matches `rows` that it saw.
+    /// With what one more network says of the matches that it saw, which stand in `rows` here.
     Opinion joined(const Opinion& other, const Rows& rows) const;
 
     /// Those of the matches `rows` that a deeper network should see; a few, the best, in any case.
@@ -45,8 +45,11 @@ Rows select_network_input(const PairInput& pair, const ModelMetadata& metadata, 
 /// One forward pass; nothing where no match enters.
 std::optional<NetworkOutput> run_network(const Network& network, const PairInput& pair, const Rows& sent);
 
-/// Logits of all matches: the network's, the prior's below the decision threshold, or invalid.
-std::vector<float> assemble_logits(const PairInput& pair, const Rows& sent, const std::optional<NetworkOutput>& output,
-                                   const ModelMetadata& metadata);
+/// Logits of the matches that enter no network: the prior's, below the decision threshold; those of the others invalid.
+std::vector<float> prior_logits(const PairInput& pair, const Rows& sent, const ModelMetadata& metadata);
+
+/// Logits of the matches that a network saw; invalid where degenerate input, all points equal, say, left it without a
+/// finite answer.
+std::vector<float> finite_logits(const NetworkOutput& output);
 
 }  // namespace mgca::detail

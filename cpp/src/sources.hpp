@@ -26,6 +26,7 @@ struct Proposal {
     int iterations = 0;
     int number = 0;       // added to the seed, so that no two draw the same samples
     double margin = 0.0;  // logit above the decision threshold
+    bool rough = false;   // with intrinsics, where what it proposes is refined
 };
 
 /// What a source proposes, at most a few, unrefined: essential matrices, or fundamental matrices in normalised coordinates

@@ -19,8 +19,9 @@ constexpr double kFundamentalThresholdPx = 1.0;
 constexpr int kFundamentalIterations = 1000;
 // A plane in doubt is looked for quickly first, at a generous threshold.
 constexpr double kQuickPlanePx = 3.0, kPlanePx = 2.0;
-// A plane on which fewer of the inliers lie is one of several of a scene with depth.
-constexpr double kLeastPlaneShare = 0.7;
+// A plane on which fewer of the inliers lie is one of several of a scene with depth. Where the matches off it have fewer
+// false alarms, log10, no other plane explains the pair.
+constexpr double kLeastPlaneShare = 0.7, kClearParallaxLog10Nfa = -20.0;
 // Inliers that are hardly more than a pose takes must be this share of the list, which else holds as many by chance.
 constexpr double kFewShare = 2.0 / 3.0;
 
@@ -217,16 +218,23 @@ void test_plane(const PairInput& pair, const TwoViewModel& model, const Evidence
     if (!explained && static_cast<double>(near) < kLeastPlaneShare * static_cast<double>(distances.size())) {
         return;
     }
-    const cv::Matx33d H = best_homography(pair, evidence, options, *quick);
+    std::optional<cv::Matx33d> H;
     if (!explained) {
         const Correspondences witnesses = in_pixels(pair, fitted);
         const cv::Matx33d F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K);
-        if (!homography_explains(witnesses, *quick, F, kRefinePx) && !homography_explains(witnesses, H, F, kRefinePx)) {
+        const double log10_nfa = parallax_false_alarms(witnesses, *quick, F, kRefinePx);
+        if (log10_nfa < kClearParallaxLog10Nfa) {
             return;
+        }
+        if (log10_nfa <= kParallaxLog10Nfa) {
+            H = best_homography(pair, evidence, options, *quick);
+            if (parallax_false_alarms(witnesses, *H, F, kRefinePx) <= kParallaxLog10Nfa) {
+                return;
+            }
         }
     }
     verdict.status = Status::planar;
-    verdict.H = pair.homography_in_units(H);
+    verdict.H = pair.homography_in_units(H ? *H : polished_on_all(pair, *quick, options));
     if (!pair.calibrated()) {
         // Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
         verdict.E.reset();
@@ -244,7 +252,9 @@ Verdict plane_or(const Verdict& verdict, const PairInput& pair, const Evidence& 
     if (!quick || homography_false_alarms(sharp, *quick, kPlanePx) > kMeaningfulLog10Nfa) {
         return verdict;
     }
-    const cv::Matx33d H = best_homography(pair, evidence, options, *quick);
+    // Beside a pose the plane is a remark.
+    const cv::Matx33d H =
+        verdict.F ? polished_on_all(pair, *quick, options) : best_homography(pair, evidence, options, *quick);
     const double log10_nfa = homography_false_alarms(rows, H, kPlanePx);
     const std::vector<double> distances = sampson_distances_to_homography(sharp, H);
     const auto agreeing = static_cast<int>(

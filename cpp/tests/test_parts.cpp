@@ -444,7 +444,7 @@ void networks_are_heard_alike() {
     check::near(before.margins[0], 0.5 * (first.margins[0] - metadata.decision_threshold), 1e-6, "the mean of the priors");
     check::equal(before.networks, 0, "of which none was asked");
     check::near(before.joined(first, {0}).margins[0], first.margins[0], 0.0, "and counts no more where one was");
-    const Opinion second = Opinion::of({1.0F, 1.0F, 1.0F}, metadata), third = Opinion::of({4.0F, 7.0F, 1.0F}, metadata);
+    const Opinion second = Opinion::of({1.0F, 1.0F}, metadata), third = Opinion::of({4.0F, 7.0F}, metadata);
     const Opinion two = first.joined(second, {0, 1}), three = two.joined(third, {0, 1});
     check::that(two.log_odds == std::vector<float>{6.0F, 0.0F, -15.0F}, "the mean, where both saw the match");
     check::that(two.margins == std::vector<float>{2.0F, -1.0F, -8.5F} && two.networks == 2, "of the margins likewise");

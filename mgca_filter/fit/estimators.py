@@ -28,6 +28,8 @@ _PRESETS = {
     "homography": (cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
     "homography in order": (cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MSAC, cv2.LOCAL_OPTIM_INNER_LO, 20, 12),
 }
+# A rough run: rounds of local optimisation, and the most that is asked of the probability of a clean sample.
+_ROUGH_LO_ITERATIONS, _ROUGH_CONFIDENCE = 3, 0.95
 # For F OpenCV's USAC_MAGSAC optimises on larger samples.
 _MAGSAC_FUNDAMENTAL_LO_SAMPLE = 50
 # PoseLib may take ten times as many before it gives up, which takes seconds.
@@ -47,6 +49,7 @@ class EstimatorOptions:
         confidence: probability that a sample without outliers was drawn.
         max_iterations: largest number of samples.
         seed: of the random numbers.
+        rough: of ``"magsac"``: the model is refined afterwards, and need not be good.
     """
 
     method: str = "prosac"
@@ -54,6 +57,7 @@ class EstimatorOptions:
     confidence: float = 0.9999
     max_iterations: int = 5000
     seed: int = 0
+    rough: bool = False
 
 
 def fit_epipolar(rows: Array, focal_px: float, options: EstimatorOptions, calibrated: bool) -> Array | None:
@@ -93,6 +97,9 @@ def _fit_opencv(rows: Array, focal_px: float, options: EstimatorOptions, calibra
             M, _ = _find_fundamental_mat(x1, x2, cv2.FM_RANSAC, threshold, *limits)
         else:
             params = usac_params(options.method, threshold, *limits, options.seed)
+            if options.rough:
+                params.loIterations = _ROUGH_LO_ITERATIONS
+                params.confidence = min(options.confidence, _ROUGH_CONFIDENCE)
             if not calibrated and options.method == "magsac":
                 params.loSampleSize = _MAGSAC_FUNDAMENTAL_LO_SAMPLE
             if calibrated:

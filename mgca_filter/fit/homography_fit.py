@@ -51,6 +51,8 @@ _LEAST_WEIGHT = 0.2
 # A sample has two coordinates of noise a match: the first step of its refinement reaches this much further.
 _WIDE_FACTOR = 3.0
 _CAUCHY_SIGMAS, _POLISH_ROUNDS = 1.25, 6
+# Matches farther than this many thresholds from a homography do not come near by polishing it.
+_REACH = 12.0
 
 
 @dataclass(frozen=True)
@@ -151,6 +153,7 @@ def polish_homography(correspondences: Array, H: Array, options: HomographyOptio
     """
     with np.errstate(all="ignore"):
         rows = correspondences[np.sort(distinct_rows(correspondences))]
+        rows = rows[sampson_distance_to_homography(rows, H) < _REACH * options.threshold]
         search = _Search.of(rows, np.ones(len(rows)), np.arange(len(rows)), None, options)
         if search is None or not np.isfinite(H).all():
             return H
@@ -367,10 +370,13 @@ class _Search:
         frames = local_frames(self._rows[near, :2], H)
         if not np.isfinite(frames).all():
             return False
-        stretch = np.linalg.svd(frames, compute_uv=False)
-        orientation = np.sign(np.linalg.det(frames))
+        # Singular values of 2 x 2 matrices, by their squares' sum and their product.
+        squares, area = np.einsum("nij,nij->n", frames, frames), np.linalg.det(frames)
+        longest = np.sqrt(0.5 * (squares + np.sqrt(np.maximum(squares**2 - 4.0 * area**2, 0.0))))
+        orientation = np.sign(area)
         alike = bool(np.all(orientation == orientation[0])) and (self._options.reflection or orientation[0] > 0)
-        return alike and float(stretch.max()) < MAX_STRETCH and float(stretch.min()) > 1.0 / MAX_STRETCH
+        shortest = float((np.abs(area) / longest).min())
+        return alike and float(longest.max()) < MAX_STRETCH and shortest > 1.0 / MAX_STRETCH
 
     def _enough(self) -> bool:
         """True where some head of the list has given enough samples for its share of inliers."""

@@ -48,12 +48,12 @@ TWIN_SHARE, TWIN_PX = 0.5, 2.0
 
 # What needs no network; then what uses it; then what is still tried where those do not settle it.
 BEFORE_NETWORK = (
-    Proposal("list", Family.LIST_UNIFORM, sources.listed, "magsac", 0.5, 300, 0),
-    Proposal("list, 1 px", Family.LIST_UNIFORM, sources.listed, "magsac", 1.0, 300, 4),
+    Proposal("list", Family.LIST_UNIFORM, sources.listed, "magsac", 0.5, 300, 0, rough=True),
+    Proposal("list, 1 px", Family.LIST_UNIFORM, sources.listed, "magsac", 1.0, 300, 4, rough=True),
 )
 FIRST = (
     Proposal("network", Family.NETWORK, sources.network),
-    Proposal("accepted", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 300, 1),
+    Proposal("accepted", Family.ACCEPTED, sources.accepted, "magsac", 0.5, 300, 1, rough=True),
     Proposal("score order", Family.SCORE_ORDER, sources.above(-1.0), "prosac", 1.0, 1000, 0),
 )
 SECOND = (
@@ -220,7 +220,8 @@ class Search:
         options = self._options
         iterations = min(proposal.iterations, options.max_iterations)
         seed = options.seed + proposal.number
-        run = EstimatorOptions(proposal.method, proposal.threshold_px, options.confidence, iterations, seed)
+        rough = proposal.rough and self._evidence.calibrated
+        run = EstimatorOptions(proposal.method, proposal.threshold_px, options.confidence, iterations, seed, rough)
         return proposal.source(self._evidence, run)
 
     def _propose(self, proposals: Sequence[Proposal]) -> None:

@@ -47,6 +47,7 @@ class Proposal:
         threshold_px: what it takes for an inlier, pixels.
         iterations: the most that it draws.
         number: added to the seed, so that no two draw the same samples.
+        rough: with intrinsics, where what it proposes is refined, see :class:`EstimatorOptions`.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Proposal:
     threshold_px: float = 0.5
     iterations: int = 0
     number: int = 0
+    rough: bool = False
 
 
 def network(evidence: Evidence, options: EstimatorOptions) -> list[Array]:

@@ -24,7 +24,14 @@ from .estimators import HOMOGRAPHY_THRESHOLD_FACTOR, EstimatorOptions, fit_epipo
 from .evidence import FIRM_MATCHES, MIN_MATCHES, Evidence, distinct_rows
 from .focal_check import better_focal_factor
 from .homography_fit import HomographyOptions, estimate_homography, polish_homography
-from .planarity import MEANINGFUL_LOG10_NFA, find_plane, homography_explains, homography_false_alarms
+from .planarity import (
+    MEANINGFUL_LOG10_NFA,
+    PARALLAX_LOG10_NFA,
+    find_plane,
+    homography_explains,
+    homography_false_alarms,
+    parallax_false_alarms,
+)
 from .robust_fit import REFINE_PX, TwoViewModel
 
 Array = NDArray[np.float64]
@@ -34,8 +41,9 @@ _CONTRADICTION_PX, _CONTRADICTION_ITERATIONS = 1.0, 1000
 # A plane in doubt is looked for quickly first, at a generous threshold.
 _QUICK_PLANE_PX = 3.0
 _PLANE_PX = 2.0
-# A plane on which fewer of the inliers lie is one of several of a scene with depth.
-_LEAST_PLANE_SHARE = 0.7
+# A plane on which fewer of the inliers lie is one of several of a scene with depth. Where the matches off it have fewer
+# false alarms, log10, no other plane explains the pair.
+_LEAST_PLANE_SHARE, _CLEAR_PARALLAX_LOG10_NFA = 0.7, -20.0
 # Inliers that are hardly more than a pose takes must be this share of the list, which else holds as many by chance.
 _FEW_SHARE = 2.0 / 3.0
 
@@ -271,13 +279,18 @@ def _test_plane(
     explained = degeneracy.explains(distance_px, REFINE_PX, support)
     if not explained and _explained_share(distance_px) < _LEAST_PLANE_SHARE:
         return verdict
-    H = _best_homography(pair, evidence, options, quick)
+    H = None
     if not explained:
         fitted = np.hstack(pair.pixels(fitted_rows))
         F = fundamental_from_essential(model.M, pair.intrinsics1.K, pair.intrinsics2.K)
-        if not any(homography_explains(fitted, plane, F, REFINE_PX) for plane in (quick, H)):
+        log10_nfa = parallax_false_alarms(fitted, quick, F, REFINE_PX)
+        if log10_nfa < _CLEAR_PARALLAX_LOG10_NFA:
             return verdict
-    H = pair.homography_in_units(H)
+        if log10_nfa <= PARALLAX_LOG10_NFA:
+            H = _best_homography(pair, evidence, options, quick)
+            if not homography_explains(fitted, H, F, REFINE_PX):
+                return verdict
+    H = pair.homography_in_units(_polished_on_all(pair, quick, options) if H is None else H)
     planar = replace(verdict, status=Status.PLANAR, H=H, info={**verdict.info, "homography": H})
     # Seven points on a plane leave F a family of solutions: it still sorts matches but holds no pose.
     return planar if pair.calibrated else replace(planar, E=None, R=None, t=None)
@@ -296,7 +309,10 @@ def _plane_or(
     quick = fit_homography(sharp[:, :2], sharp[:, 2:], _QUICK_PLANE_PX, options.seed, ordered=True)
     if quick is None or homography_false_alarms(sharp, quick, _PLANE_PX) > MEANINGFUL_LOG10_NFA:
         return verdict
-    H = _best_homography(pair, evidence, options, quick)
+    if verdict.F is None:
+        H = _best_homography(pair, evidence, options, quick)
+    else:  # beside a pose the plane is a remark
+        H = _polished_on_all(pair, quick, options)
     log10_nfa = homography_false_alarms(rows, H, _PLANE_PX)
     agreeing = int(np.count_nonzero(sampson_distance_to_homography(sharp, H) < _PLANE_PX))
     if log10_nfa > MEANINGFUL_LOG10_NFA or agreeing < degeneracy.MIN_SUPPORT:

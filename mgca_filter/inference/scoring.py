@@ -48,10 +48,15 @@ class NetworkOutput:
     logits: NDArray[np.float32]
     essential: NDArray[np.float32]
 
+    @property
+    def finite_logits(self) -> NDArray[np.float32]:
+        """(N,); invalid where degenerate input, all points equal, say, left the network without a finite answer."""
+        return np.where(np.isfinite(self.logits), self.logits, np.float32(INVALID_LOGIT))
+
 
 @dataclass(frozen=True)
 class Opinion:
-    """What the networks that were asked say of the M matches of a pair, each as much as another.
+    """What the networks that were asked say of M matches, each as much as another.
 
     Attributes:
         margins: (M,) float32, logits above the decision threshold. log_odds: (M,) float32, calibrated.
@@ -82,12 +87,12 @@ class Opinion:
         return cls(margins, log_odds, networks=0)
 
     def joined(self, other: Opinion, rows: NDArray[np.intp]) -> Opinion:
-        """With what one more network says of the matches ``rows`` (N,) that it saw."""
+        """With what one more network says of N matches that it saw, which stand in ``rows`` (N,) here."""
         networks = self.networks + other.networks
         share = np.float32(other.networks / networks)
         margins, log_odds = self.margins.copy(), self.log_odds.copy()
         for mean, new in ((margins, other.margins), (log_odds, other.log_odds)):
-            mean[rows] = (1 - share) * mean[rows] + share * new[rows]
+            mean[rows] = (1 - share) * mean[rows] + share * new
         return Opinion(margins, log_odds, networks)
 
     def undecided(self, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -143,21 +148,13 @@ def run_network(backend: Backend, inputs: Sequence[NetworkInput]) -> list[Networ
     return [NetworkOutput(logits[i], essential[i]) for i in range(len(inputs))]
 
 
-def assemble_logits(
-    attributes: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-    sent: NetworkInput,
-    output: NetworkOutput | None,
-    backend: Backend,
+def prior_logits(
+    attributes: NDArray[np.float32], unseen: NDArray[np.bool_], metadata: ModelMetadata
 ) -> NDArray[np.float32]:
-    """Logits (M,) of all matches: the network's, the prior's below the decision threshold, or invalid."""
-    metadata = backend.metadata
+    """Logits (M,), below the decision threshold, of the matches ``unseen`` (M,) by a network; of others invalid."""
     ceiling = metadata.decision_threshold - _REJECTED_MARGIN
-    logits = np.full(len(valid), INVALID_LOGIT, dtype=np.float32)
-    logits[valid] = _below(metadata.prior.logits(attributes[valid]), ceiling)
-    if output is not None:
-        # Degenerate input (all points equal, say) may leave the network without a finite answer.
-        logits[sent.rows] = np.where(np.isfinite(output.logits), output.logits, INVALID_LOGIT)
+    logits = np.full(len(unseen), INVALID_LOGIT, dtype=np.float32)
+    logits[unseen] = _below(metadata.prior.logits(attributes[unseen]), ceiling)
     return logits
 
 

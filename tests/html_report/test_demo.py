@@ -25,7 +25,7 @@ from mgca_filter.features import create_detector, describe, match_features
 from mgca_filter.geometry.cameras import normalize_points
 from mgca_filter.geometry.epipolar import fundamental_from_essential, sampson_distance
 from mgca_filter.inference import Backend, open_backend
-from mgca_filter.inference.scoring import assemble_logits, run_network, select_network_input
+from mgca_filter.inference.scoring import prior_logits, run_network, select_network_input
 
 pytest.importorskip("skimage")
 pytestmark = [needs_chromium, pytest.mark.slow, pytest.mark.timeout(600)]
@@ -111,7 +111,9 @@ def python_answer(pair: dict[str, Any], backend: Backend) -> tuple[np.ndarray, n
     valid = np.ones(len(x), dtype=bool)
     sent = select_network_input(x, attributes, valid, backend, seed=0)
     (output,) = run_network(backend, [sent])
-    return assemble_logits(attributes, valid, sent, output, backend), sent.rows, output.essential
+    logits = prior_logits(attributes, valid, backend.metadata)
+    logits[sent.rows] = output.finite_logits
+    return logits, sent.rows, output.essential
 
 
 @pytest.mark.parametrize("name", AGREEMENT)

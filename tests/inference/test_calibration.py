@@ -10,7 +10,7 @@ from conftest import K, make_scene
 
 from mgca_filter import MatchFilter
 from mgca_filter.inference.calibration import AttributePrior, Calibration, gelu, largest_set_of_precision, sigmoid
-from mgca_filter.inference.scoring import INVALID_LOGIT, assemble_logits, select_network_input
+from mgca_filter.inference.scoring import INVALID_LOGIT, prior_logits, select_network_input
 
 
 def test_calibration_and_prior_follow_their_formulas() -> None:
@@ -45,7 +45,7 @@ def test_scoring_takes_any_usable_coordinates(match_filter: MatchFilter, coordin
     valid = np.arange(40) > 0
     with np.errstate(all="raise"):
         sent = select_network_input(correspondences, attributes, valid, backend, seed=0)
-        logits = assemble_logits(attributes, valid, sent, None, backend)
+        logits = prior_logits(attributes, valid, backend.metadata)
     assert sent.rows.tolist() == list(range(1, 40))
     assert logits[0] == INVALID_LOGIT
     assert (logits[1:] > INVALID_LOGIT).all()
