@@ -29,6 +29,7 @@ from ..geometry.homography import (
     sampson_distance_to_homography,
     scaled_homography,
 )
+from ..geometry.matrix_product import product
 from .evidence import distinct_rows
 
 Array = NDArray[np.float64]
@@ -272,7 +273,7 @@ class _Search:
         if len(rows) < 3 * _NEIGHBOURS:
             return None
         squared = np.sum(rows**2, axis=1)
-        distance = squared[:, None] + squared[None] - 2.0 * rows @ rows.T
+        distance = squared[:, None] + squared[None] - product(2.0 * rows, rows.T)
         np.fill_diagonal(distance, np.inf)
         near = np.argpartition(distance, _NEIGHBOURS, axis=1)[:, :_NEIGHBOURS]
         if len(self._rows) > len(rows):

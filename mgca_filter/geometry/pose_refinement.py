@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from .epipolar import cross_matrix, homogeneous_columns
 from .least_squares import promises
+from .matrix_product import product
 
 Array = NDArray[np.float64]
 # Cost of residuals (N,), and by how much each counts in the squares that stand for it near by, (N,).
@@ -192,12 +193,12 @@ def costs_of_directions(rows: Array, R: Array, directions: Array) -> Array:
     normals = np.concatenate([(_TURNS @ rays)[:, :2], R.T[:2] @ -(_TURNS @ x2)], axis=1)  # (3, 4, N)
     forms = np.einsum("jkn,lkn->jln", normals, normals).reshape(9, -1)
     squares = np.einsum("dj,dl->djl", directions, directions).reshape(-1, 9)  # (D, 9)
-    weight = 1.0 / np.maximum(squares @ forms, np.finfo(np.float64).tiny)  # (D, N)
+    weight = 1.0 / np.maximum(product(squares, forms), np.finfo(np.float64).tiny)  # (D, N)
     error = directions @ _cross(rays, x2)
     A = x2[:, None] * rays[None] - np.sum(rays * x2, axis=0) * np.eye(3)[..., None]  # (3, 3, N)
     pairs = np.einsum("jln,kmn->jklmn", A, A).reshape(81, -1)
-    gradient = np.einsum("djl,dl->dj", ((weight * error) @ A.reshape(9, -1).T).reshape(-1, 3, 3), directions)
-    hessian = np.einsum("djkl,dl->djk", (weight @ pairs.T).reshape(-1, 3, 3, 9), squares)
+    gradient = np.einsum("djl,dl->dj", product(weight * error, A.reshape(9, -1).T).reshape(-1, 3, 3), directions)
+    hessian = np.einsum("djkl,dl->djk", product(weight, pairs.T).reshape(-1, 3, 3, 9), squares)
     hessian += _SMALLEST_CURVATURE * np.eye(3)
     gain = np.einsum("dk,dk->d", gradient, np.linalg.solve(hessian, gradient[..., None])[..., 0])
     return np.asarray(np.einsum("dn,dn->d", weight * error, error) - gain, dtype=np.float64)

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..geometry.matrix_product import product
+
 # Abramowitz & Stegun 7.1.26: absolute error below 1.5e-7, the resolution of float32 logits.
 _ERF_P = 0.3275911
 _ERF_COEFFICIENTS = (1.061405429, -1.453152027, 1.421413741, -0.284496736, 0.254829592)
@@ -77,7 +79,7 @@ class AttributePrior:
     def logits(self, attributes: NDArray[np.float32]) -> NDArray[np.float32]:
         """Logits (N,) float32 from encoded attributes (N, 8)."""
         with np.errstate(all="ignore"):
-            hidden = gelu(attributes.astype(np.float64) @ self.weight1.T + self.bias1)
+            hidden = gelu(product(attributes.astype(np.float64), self.weight1.T) + self.bias1)
             return (hidden @ self.weight2 + self.bias2).astype(np.float32)
 
 
