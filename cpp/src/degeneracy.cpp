@@ -143,7 +143,10 @@ bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<
     if (turned.empty()) {
         return false;
     }
-    const double noise = std::max(kToSigma * median(epipolar), kLeastNoisePx);
+    const auto count = static_cast<double>(turned.size());
+    // E has taken as many residuals as it has degrees of freedom.
+    const double left = std::max(count - kModelFreedom, 1.0);
+    const double noise = std::max(kToSigma * median(epipolar) * std::sqrt(count / left), kLeastNoisePx);
     // Half the root of four squared components: of noise alone their expectation is twice that of a Sampson distance.
     const auto cost = [noise](const std::vector<double>& distances) {
         double sum = 0.0;
@@ -152,7 +155,6 @@ bool prefers_rotation(const std::vector<double>& rotation_px, const std::vector<
         }
         return sum;
     };
-    const auto count = static_cast<double>(turned.size());
     // Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
     const double price = kPriceOfDimension * count + 2.0 * std::log(4.0 * count);
     return cost(turned) - cost(epipolar) < price;

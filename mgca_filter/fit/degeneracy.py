@@ -146,7 +146,9 @@ def prefers_rotation(rotation_px: Array, epipolar_px: Array) -> bool:
     turned = rotation_px < 2.0 * EXPLAINED_THRESHOLD_FACTOR
     rotation_px, epipolar_px = rotation_px[turned], epipolar_px[turned]
     count = len(epipolar_px)
-    noise = max(TO_SIGMA * float(np.median(epipolar_px)), LEAST_NOISE_PX)
+    # E has taken as many residuals as it has degrees of freedom.
+    left = max(count - _MODEL_FREEDOM, 1)
+    noise = max(TO_SIGMA * float(np.median(epipolar_px)) * sqrt(count / left), LEAST_NOISE_PX)
     # The root of two squared components: of noise alone their expectation is twice that of a distance to E.
     costs = [float(np.minimum((d / noise) ** 2, _GRIC_CUT**2).sum()) for d in (rotation_px, epipolar_px)]
     # Steeper than log 4 a match: E was chosen among many, and the noise is that of the residuals that it leaves.
