@@ -49,6 +49,15 @@ def _without(*names: str) -> Plan:
     return replace(PLAN, before=before, first=first, second=second)
 
 
+def _drawing(factor: float) -> Plan:
+    """The plan with so many times the samples."""
+    before, first, second = (
+        tuple(replace(proposal, iterations=int(factor * proposal.iterations)) for proposal in stage)
+        for stage in (PLAN.before, PLAN.first, PLAN.second)
+    )
+    return replace(PLAN, before=before, first=first, second=second)
+
+
 @dataclass(frozen=True)
 class Variant:
     """A fit with one thing changed: the plan, the options, whether it may end before the network, or who is asked.
@@ -74,6 +83,9 @@ VARIANTS = {
     "without runs on the list": Variant(_without("list", "list, 1 px", "list order"), early_end=False),
     "without runs on what is accepted": Variant(_without("accepted"), early_end=False),
     "without runs in the order of the scores": Variant(_without("score order", "score order, all"), early_end=False),
+    "a quarter of the samples": Variant(_drawing(0.25)),
+    "half the samples": Variant(_drawing(0.5)),
+    "twice the samples": Variant(_drawing(2.0)),
     "without the twin under the plane": Variant(replace(PLAN, twins=False)),
     "without the last refinement": Variant(replace(PLAN, last_refinement=False)),
     "PoseLib among the sources": Variant(replace(PLAN, second=(*PLAN.second, POSELIB))),
