@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +27,7 @@ from mgca_filter.evaluation.metrics import (
 from mgca_filter.export.choice_fit import filters_as_asked, scored_evidence
 from mgca_filter.fit.evidence import Evidence, gather_before
 from mgca_filter.fit.robust_fit import PLAN, POSELIB, Plan, Search, TwoViewModel
+from mgca_filter.fit.sources import Proposal
 from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.options import FilterOptions
 from mgca_filter.inputs.pair import prepare_pair
@@ -40,22 +41,20 @@ AS_IT_IS = "the fit as it is"
 RIGHT_DEG = 10.0
 
 
+def _each_stage(change: Callable[[Sequence[Proposal]], Iterable[Proposal]]) -> Plan:
+    """The plan with the sources of every stage changed."""
+    before, first, second = (tuple(change(stage)) for stage in (PLAN.before, PLAN.first, PLAN.second))
+    return replace(PLAN, before=before, first=first, second=second)
+
+
 def _without(*names: str) -> Plan:
     """The plan without the sources of these names."""
-    before, first, second = (
-        tuple(proposal for proposal in stage if proposal.name not in names)
-        for stage in (PLAN.before, PLAN.first, PLAN.second)
-    )
-    return replace(PLAN, before=before, first=first, second=second)
+    return _each_stage(lambda stage: (proposal for proposal in stage if proposal.name not in names))
 
 
 def _drawing(factor: float) -> Plan:
     """The plan with so many times the samples."""
-    before, first, second = (
-        tuple(replace(proposal, iterations=int(factor * proposal.iterations)) for proposal in stage)
-        for stage in (PLAN.before, PLAN.first, PLAN.second)
-    )
-    return replace(PLAN, before=before, first=first, second=second)
+    return _each_stage(lambda stage: (replace(one, iterations=int(factor * one.iterations)) for one in stage))
 
 
 @dataclass(frozen=True)
