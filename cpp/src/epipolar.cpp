@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <utility>
 
 namespace mgca::detail {
 
@@ -55,16 +56,22 @@ cv::Matx33d project_to_essential(const cv::Matx33d& M) {
     return U * cv::Matx33d::diag({1.0, 1.0, 0.0}) * Vt * (1.0 / std::sqrt(2.0));
 }
 
-std::array<Pose, 4> decompose_essential(const cv::Matx33d& E) {
+std::array<Pose, 4> decompose_essential(const cv::Matx33d& M) {
     cv::Matx33d U, Vt;
     cv::Matx31d values;
-    cv::SVD::compute(E, values, U, Vt);
-    U = U * (cv::determinant(U) < 0.0 ? -1.0 : 1.0);
-    Vt = Vt * (cv::determinant(Vt) < 0.0 ? -1.0 : 1.0);
+    cv::SVD::compute(M, values, U, Vt);
+    const double sign = cv::determinant(U) * cv::determinant(Vt) < 0.0 ? -1.0 : 1.0;
     const cv::Matx33d W(0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0);
-    const cv::Matx33d R_a = U * W * Vt, R_b = U * W.t() * Vt;
-    const cv::Vec3d t(U(0, 2), U(1, 2), U(2, 2));
-    return {Pose{R_a, t}, Pose{R_a, -t}, Pose{R_b, t}, Pose{R_b, -t}};
+    cv::Matx33d smaller = sign * (U * W * Vt), larger = sign * (U * W.t() * Vt);
+    if (cv::trace(larger) > cv::trace(smaller)) {
+        std::swap(smaller, larger);
+    }
+    cv::Vec3d t(U(0, 2), U(1, 2), U(2, 2));
+    const auto longer = [](double a, double b) { return std::abs(a) < std::abs(b); };
+    if (*std::max_element(t.val, t.val + 3, longer) < 0.0) {
+        t = -t;
+    }
+    return {Pose{smaller, t}, Pose{smaller, -t}, Pose{larger, t}, Pose{larger, -t}};
 }
 
 bool usable(const cv::Matx33d& M) {

@@ -50,8 +50,10 @@ double parallax(const Correspondence& match, const cv::Matx33d& R);
 /// Closest matrix with singular values (s, s, 0), scaled to unit Frobenius norm.
 cv::Matx33d project_to_essential(const cv::Matx33d& M);
 
-/// The four poses of an essential matrix (Hartley & Zisserman 9.6.2).
-std::array<Pose, 4> decompose_essential(const cv::Matx33d& E);
+/// The four poses of the essential matrix closest to M (Hartley & Zisserman 9.6.2), the smaller rotation first; of a
+/// direction the sign that makes its largest part positive, so that the order does not depend on who computes the singular
+/// vectors.
+std::array<Pose, 4> decompose_essential(const cv::Matx33d& M);
 
 /// Finite and not all zero.
 bool usable(const cv::Matx33d& M);

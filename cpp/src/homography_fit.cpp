@@ -2,6 +2,7 @@
 
 #include "degeneracy.hpp"
 #include "evidence.hpp"
+#include "least_squares.hpp"
 #include "statistics.hpp"
 
 #include <algorithm>
@@ -118,12 +119,14 @@ cv::Matx33d refine(const Correspondences& rows, cv::Matx33d H, double threshold,
         Matx88d hessian;
         Vec8d gradient;
         int near = 0;
+        double cost_of_near = 0.0;
         for (std::size_t i = 0; i < rows.size(); ++i) {
             const Residual residual(rows[i], H);
             if (!(residual.squared < threshold * threshold)) {
                 continue;
             }
             ++near;
+            cost_of_near += weights[i] * residual.squared;
             const double x1 = rows[i][0], y1 = rows[i][1], x2 = rows[i][2], y2 = rows[i][3];
             cv::Matx<double, 1, 9> first(-x1, -y1, -1.0, 0.0, 0.0, 0.0, x2 * x1, x2 * y1, x2);
             first = first * (1.0 / residual.l11);
@@ -146,6 +149,9 @@ cv::Matx33d refine(const Correspondences& rows, cv::Matx33d H, double threshold,
                 damped(k, k) += damping * (hessian(k, k) + smallest);
             }
             const cv::Matx<double, 8, 1> step = damped.solve(cv::Matx<double, 8, 1>(-gradient), cv::DECOMP_LU);
+            if (!promises<8>(hessian, gradient, step, kConvergedDecrease * cost_of_near)) {
+                return H;
+            }
             const cv::Matx<double, 9, 1> move = along * step;
             const cv::Matx33d candidate = unit_norm(H + cv::Matx33d(move.val));
             const double candidate_cost = truncated(rows, candidate, threshold, weights);

@@ -52,7 +52,7 @@ std::vector<Pose> poses_of_network(const Evidence& evidence) {
     if (!E) {
         return {};
     }
-    const auto poses = decompose_essential(project_to_essential(*E));
+    const auto poses = decompose_essential(*E);
     return {poses.begin(), poses.end()};
 }
 
@@ -397,7 +397,7 @@ std::optional<Pose> pose_from_essential(const cv::Matx33d& E, const Corresponden
     }
     std::optional<Pose> best;
     std::ptrdiff_t fewest = 0;
-    for (const Pose& pose : decompose_essential(project_to_essential(E))) {
+    for (const Pose& pose : decompose_essential(E)) {
         const Residuals residuals = measure_residuals(near, pose, focal_px);
         const std::ptrdiff_t behind = std::count(residuals.behind.begin(), residuals.behind.end(), 1);
         if (!best || behind < fewest) {

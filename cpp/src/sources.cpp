@@ -2,8 +2,31 @@
 
 #include "homography.hpp"
 
+#include <algorithm>
+#include <cmath>
+
 namespace mgca::detail {
 namespace {
+
+// A rough run on the list sees no more matches than this: what it proposes is refined and judged on all.
+constexpr std::size_t kRoughMatches = 600;
+
+/// The list in its own order; for a rough run the most promising of a long one, or, where nothing tells them, some of all
+/// parts of it.
+Correspondences listed(const Evidence& evidence, bool rough) {
+    Correspondences rows = evidence.by_list_order();
+    if (!rough || rows.size() <= kRoughMatches) {
+        return rows;
+    }
+    const std::size_t count = rows.size();
+    if (std::none_of(evidence.order.begin(), evidence.order.end(), [](double o) { return std::isfinite(o); })) {
+        for (std::size_t i = 0; i < kRoughMatches; ++i) {
+            rows[i] = rows[i * count / kRoughMatches];
+        }
+    }
+    rows.resize(kRoughMatches);
+    return rows;
+}
 
 std::vector<cv::Matx33d> estimate(const Correspondences& rows, const Evidence& evidence,
                                   const EstimatorOptions& options) {
@@ -22,7 +45,7 @@ std::vector<cv::Matx33d> propose(const Proposal& proposal, const Evidence& evide
             const auto E = evidence.network_essential();
             return E && evidence.calibrated ? std::vector<cv::Matx33d>{*E} : std::vector<cv::Matx33d>{};
         }
-        case Source::listed: return estimate(evidence.by_list_order(), evidence, options);
+        case Source::listed: return estimate(listed(evidence, options.rough), evidence, options);
         case Source::accepted: return estimate(evidence.take(evidence.accepted()), evidence, options);
         case Source::above: return estimate(evidence.take(evidence.above(proposal.margin)), evidence, options);
     }

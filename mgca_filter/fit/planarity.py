@@ -8,6 +8,7 @@ the list at several lengths, because a small object has its matches at the head 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import lgamma, log
 from typing import Any
@@ -144,10 +145,10 @@ def _fewest_false_alarms(
         heads.append(heads[-1] // 2)
     tests = log(len(heads) * len(_THRESHOLD_FACTORS), 10.0)
     least, count_at_threshold = float("inf"), 0
-    for factor in _THRESHOLD_FACTORS:
-        threshold = factor * options.threshold
+    thresholds = [factor * options.threshold for factor in _THRESHOLD_FACTORS]
+    rates = chance_rates(rows, H, thresholds, size1, size2)
+    for factor, threshold, rate in zip(_THRESHOLD_FACTORS, thresholds, rates):
         witnesses = _independent(rows, distance, threshold, 2.0 * options.threshold)
-        rate = chance_rate(rows, H, threshold, size1, size2)
         if factor == 1.0:
             count_at_threshold = int(np.count_nonzero(witnesses))
         for head in heads:
@@ -171,10 +172,14 @@ def _independent(rows: Array, distance: Array, threshold: float, radius: float) 
     return chosen
 
 
-def chance_rate(
-    correspondences: Array, H: Array, threshold: float, size1: SizeLike | None = None, size2: SizeLike | None = None
-) -> float:
-    """Share of the wrong pairings of the same points (N, 4) that agree with a homography, all in pixels.
+def chance_rates(
+    correspondences: Array,
+    H: Array,
+    thresholds: Sequence[float],
+    size1: SizeLike | None = None,
+    size2: SizeLike | None = None,
+) -> list[float]:
+    """Share of the wrong pairings of the same points (N, 4) that agree with a homography, all in pixels, by threshold.
 
     Measured on all pairings of some of the points; what the areas of the images foretell counts as one observed
     agreement, so that a rate that was never observed is not zero.
@@ -189,21 +194,24 @@ def chance_rate(
         backward = _squared_distances(rows[:, :2], back)
         # Of a similarity of scale s the Sampson distance is d / √(1 + s²): the two transfer errors give it without
         # a derivative of each pairing.
-        agreeing = forward * backward < threshold**2 * (forward + backward)
-    np.fill_diagonal(agreeing, False)
+        squared = forward * backward / (forward + backward)
+    np.fill_diagonal(squared, np.inf)
     area = [
         float(np.prod(size)) if size is not None else float(np.prod(np.ptp(part, axis=0)))
         for size, part in ((size1, correspondences[:, :2]), (size2, correspondences[:, 2:]))
     ]
-    room = max(max(area), np.pi * threshold**2)
-    expected = min(2.0 * np.pi * threshold**2 / room, 0.5)
-    return float((np.count_nonzero(agreeing) + 1.0) / (count * (count - 1) + 1.0 / expected))
+    rates = []
+    for threshold in thresholds:
+        room = max(max(area), np.pi * threshold**2)
+        expected = min(2.0 * np.pi * threshold**2 / room, 0.5)
+        agreeing = np.count_nonzero(squared < threshold**2)
+        rates.append((agreeing + 1.0) / (count * (count - 1) + 1.0 / expected))
+    return rates
 
 
 def _squared_distances(a: Array, b: Array) -> Array:
     """(N, M) of points (N, 2) and (M, 2)."""
-    difference = a[:, None] - b[None]
-    return np.asarray(np.einsum("nmi,nmi->nm", difference, difference), dtype=np.float64)
+    return np.asarray(np.subtract.outer(a[:, 0], b[:, 0]) ** 2 + np.subtract.outer(a[:, 1], b[:, 1]) ** 2)
 
 
 def _log10_nfa(count: int, inliers: int, freedom: int, rate: float) -> float:

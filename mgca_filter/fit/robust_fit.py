@@ -410,7 +410,7 @@ def pose_from_essential(E: Array, correspondences: Array, focal_px: float) -> tu
     near = correspondences[sampson_distance(correspondences, E) < REFINE_PX / focal_px]
     if len(near) == 0:
         return None
-    poses = decompose_essential(project_to_essential(E))
+    poses = decompose_essential(E)
     R, t = np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
     behind = choice.lie_behind(near, R, t, focal_px)
     return poses[int(np.argmin(behind.sum(axis=1)))]
@@ -421,7 +421,7 @@ def _poses_of_network(evidence: Evidence) -> tuple[Array, Array] | None:
     E = evidence.network_essential
     if E is None or not np.isfinite(E).all() or not np.any(E):
         return None
-    R, t = zip(*decompose_essential(project_to_essential(E)))
+    R, t = zip(*decompose_essential(E))
     return np.stack(R), np.stack(t)
 
 

@@ -21,6 +21,9 @@ from .evidence import MIN_MATCHES, Evidence
 
 Array = NDArray[np.float64]
 
+# A rough run on the list sees no more matches than this: what it proposes is refined and judged on all.
+ROUGH_MATCHES = 600
+
 
 class Family(IntEnum):
     """What a source sees."""
@@ -68,8 +71,15 @@ def network(evidence: Evidence, options: EstimatorOptions) -> list[Array]:
 
 
 def listed(evidence: Evidence, options: EstimatorOptions) -> list[Array]:
-    """A robust estimator on the list, as a classical pipeline runs it; ordered estimators get the list's own order."""
-    return _estimate(evidence.by_list_order(), evidence, options)
+    """A robust estimator on the list, as a classical pipeline runs it; ordered estimators get the list's own order.
+
+    A rough run gets the most promising matches of a long list, or, where nothing tells them, some of all parts of it.
+    """
+    rows = evidence.by_list_order()
+    if options.rough and len(rows) > ROUGH_MATCHES:
+        ordered = np.isfinite(evidence.order).any()
+        rows = rows[:ROUGH_MATCHES] if ordered else rows[np.arange(ROUGH_MATCHES) * len(rows) // ROUGH_MATCHES]
+    return _estimate(rows, evidence, options)
 
 
 def accepted(evidence: Evidence, options: EstimatorOptions) -> list[Array]:

@@ -113,14 +113,22 @@ def project_to_essential(M: ArrayLike) -> FloatArray:
     return projected
 
 
-def decompose_essential(E: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
-    """The four poses (R, t) of an essential matrix; t has unit norm (Hartley & Zisserman 9.6.2)."""
-    U, _, Vt = np.linalg.svd(np.asarray(E, dtype=np.float64))
-    U = U * np.sign(np.linalg.det(U))
-    Vt = Vt * np.sign(np.linalg.det(Vt))
-    W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    R_a, R_b, t = U @ W @ Vt, U @ W.T @ Vt, U[:, 2]
-    return [(R_a, t), (R_a, -t), (R_b, t), (R_b, -t)]
+def decompose_essential(M: ArrayLike) -> list[tuple[FloatArray, FloatArray]]:
+    """The four poses (R, t) of the essential matrix closest to ``M``; t has unit norm (Hartley & Zisserman 9.6.2).
+
+    The smaller rotation comes first, and of a direction the sign that makes its largest part positive, so that the
+    order does not depend on who computes the singular vectors.
+    """
+    U, _, Vt = np.linalg.svd(np.asarray(M, dtype=np.float64))
+    turned = np.stack([U[:, 1], -U[:, 0], U[:, 2]], axis=1)  # U W
+    rotations = np.stack([turned, turned * (-1.0, -1.0, 1.0)]) @ Vt
+    if np.linalg.det(rotations[0]) < 0.0:
+        rotations = -rotations
+    smaller = int(np.trace(rotations[1]) > np.trace(rotations[0]))
+    t = U[:, 2]
+    if t[np.argmax(np.abs(t))] < 0.0:
+        t = -t
+    return [(rotations[i], sign * t) for i in (smaller, 1 - smaller) for sign in (1.0, -1.0)]
 
 
 def triangulated_depths(correspondences: ArrayLike, R: ArrayLike, t: ArrayLike) -> tuple[FloatArray, FloatArray]:

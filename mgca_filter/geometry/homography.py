@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .epipolar import homogeneous
+from .least_squares import promises
 
 Array = NDArray[np.float64]
 
@@ -201,12 +202,15 @@ def refine_homography(
         hessian, gradient = now.normal_equations(directions)
         diagonal = np.diag(np.diag(hessian) + 1e-12 * max(float(np.trace(hessian)), _TINY))
         previous = now.cost
+        worthless = _CONVERGED_DECREASE * float(weights[now.near] @ now.squared[now.near])
         while damping < _MAX_DAMPING:
             try:
                 step = np.linalg.solve(hessian + damping * diagonal, -gradient)
             except np.linalg.LinAlgError:
                 damping *= 10.0
                 continue
+            if not promises(hessian, gradient, step, worthless):
+                return now.H
             new_H = now.H + (directions @ step).reshape(3, 3)
             if freedom == PROJECTIVE_FREEDOM:
                 new_H = new_H / np.linalg.norm(new_H)

@@ -13,6 +13,7 @@ from mgca_filter.fit import sources
 from mgca_filter.fit.estimators import EstimatorOptions
 from mgca_filter.fit.evidence import MIN_ACCEPTED, MIN_MATCHES
 from mgca_filter.fit.robust_fit import ALONE, BEFORE_NETWORK, FIRST, POSELIB, SECOND, pose_from_essential
+from mgca_filter.fit.sources import ROUGH_MATCHES
 from mgca_filter.geometry.epipolar import essential_from_pose
 
 ROBUST = {"listed": sources.listed, "accepted": sources.accepted, "above": sources.above(0.0)}
@@ -64,6 +65,22 @@ def test_the_list_is_seen_in_its_own_order_whatever_the_network_says(scene: Scen
         rows, focal, options, calibrated = seen.pop()
         np.testing.assert_allclose(rows, by_ratio, atol=1e-12)
         assert (focal, options, calibrated) == (evidence.focal_px, RUN, True)
+
+
+def test_a_rough_run_sees_the_most_promising_of_a_long_list(seen: list) -> None:
+    long = make_scene(right=800, wrong=200)
+    rough = replace(RUN, rough=True)
+    by_ratio = normalized(long)[np.argsort(long.attributes.ratio, kind="stable")]
+    sources.listed(before(long), rough)
+    np.testing.assert_allclose(seen.pop()[0], by_ratio[:ROUGH_MATCHES], atol=1e-12)
+    sources.listed(before(long), RUN)
+    assert len(seen.pop()[0]) == 1000
+    nothing_known = replace(before(long), order=np.full(1000, np.nan))
+    sources.listed(nothing_known, rough)
+    some = seen.pop()[0]
+    assert len(some) == ROUGH_MATCHES
+    np.testing.assert_array_equal(some[:3], nothing_known.correspondences[[0, 1, 3]])
+    np.testing.assert_array_equal(some[-1], nothing_known.correspondences[998])
 
 
 def test_of_a_raw_list_a_classical_pipeline_sees_what_is_clear(scene: Scene, seen: list) -> None:

@@ -14,7 +14,7 @@ from mgca_filter.fit.homography_fit import (
     polish_homography,
 )
 from mgca_filter.fit.planarity import (
-    chance_rate,
+    chance_rates,
     find_plane,
     homography_explains,
     homography_false_alarms,
@@ -316,8 +316,9 @@ def test_false_alarms_fall_with_support_and_rise_with_the_number_of_matches() ->
 def test_chance_rate_is_the_area_that_a_match_may_fall_into() -> None:
     rows, _ = make_matches(np.eye(3), right=0, wrong=400)
     expected = np.pi * (np.sqrt(2) * 10.0) ** 2 / (640 * 480)
-    assert chance_rate(rows, np.eye(3), 10.0, SIZE, SIZE) == pytest.approx(expected, rel=0.15)
-    assert chance_rate(rows[:5], np.eye(3), 2.0, SIZE, SIZE) < 1e-3
+    rates = chance_rates(rows, np.eye(3), [5.0, 10.0], SIZE, SIZE)
+    assert rates == pytest.approx([expected / 4.0, expected], rel=0.15)
+    assert chance_rates(rows[:5], np.eye(3), [2.0], SIZE, SIZE)[0] < 1e-3
 
 
 def test_larger_images_make_the_same_support_rarer() -> None:

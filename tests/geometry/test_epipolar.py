@@ -57,6 +57,22 @@ def test_decomposition_contains_the_pose(pose: tuple[np.ndarray, np.ndarray]) ->
     assert min(epipolar.pose_error_deg(rotation, direction, R, t) for rotation, direction in found) < 1e-3
 
 
+@given(poses, st.floats(-3.0, 3.0))
+def test_the_order_of_the_decomposition_is_no_matter_of_signs(
+    pose: tuple[np.ndarray, np.ndarray], scale: float
+) -> None:
+    assume(abs(scale) > 0.1)
+    E = epipolar.essential_from_pose(rotation_from_vector(pose[0]), pose[1])
+    rotations, directions = (np.stack(part) for part in zip(*epipolar.decompose_essential(scale * E)))
+    traces, sizes = np.trace(rotations, axis1=1, axis2=2), np.sort(np.abs(directions[0]))
+    assume(traces[0] - traces[2] > 1e-6)
+    assume(sizes[2] - sizes[1] > 1e-6)
+    assert directions[0][np.argmax(np.abs(directions[0]))] > 0.0
+    for found, expected in zip(epipolar.decompose_essential(E), zip(rotations, directions)):
+        np.testing.assert_allclose(found[0], expected[0], atol=1e-6)
+        np.testing.assert_allclose(found[1], expected[1], atol=1e-6)
+
+
 @given(st.lists(st.floats(-10, 10), min_size=9, max_size=9))
 def test_projection_to_essential_is_valid_and_idempotent(values: list[float]) -> None:
     M = np.reshape(values, (3, 3))
