@@ -200,7 +200,7 @@ def chance_rates(
         float(np.prod(size)) if size is not None else float(np.prod(np.ptp(part, axis=0)))
         for size, part in ((size1, correspondences[:, :2]), (size2, correspondences[:, 2:]))
     ]
-    rates = []
+    rates: list[float] = []
     for threshold in thresholds:
         room = max(max(area), np.pi * threshold**2)
         expected = min(2.0 * np.pi * threshold**2 / room, 0.5)
