@@ -205,7 +205,7 @@ def refine_homography(
         worthless = _CONVERGED_DECREASE * float(weights[now.near] @ now.squared[now.near])
         while damping < _MAX_DAMPING:
             try:
-                step = np.linalg.solve(hessian + damping * diagonal, -gradient)
+                step = np.asarray(np.linalg.solve(hessian + damping * diagonal, -gradient), dtype=np.float64)
             except np.linalg.LinAlgError:
                 damping *= 10.0
                 continue
