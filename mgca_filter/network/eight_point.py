@@ -115,8 +115,9 @@ def weighted_eight_point(correspondences: Tensor, weights: Tensor) -> Tensor:
     E = smallest_eigenvector_row((phi.transpose(1, 2) * row) @ phi).view(-1, 3, 3)
     transforms = torch.cat([scale, scale * centre], -1) @ constant(_CONDITIONING, E) + constant(_CONDITIONING_OFFSET, E)
     transforms = transforms.view(-1, 2, 3, 3)
-    E = transforms[:, 1] @ E @ transforms[:, 0]
-    return E / E.reshape(-1, 1, 9).norm(dim=2, keepdim=True)
+    # Divided as a vector: else OpenCV, which forgets the shape of what it reshaped, warns of every answer.
+    vector = (transforms[:, 1] @ E @ transforms[:, 0]).reshape(-1, 1, 9)
+    return (vector / vector.norm(dim=2, keepdim=True)).view(-1, 3, 3)
 
 
 def symmetric_epipolar_distance_squared(correspondences: Tensor, E: Tensor, unit: float = 1.0) -> Tensor:

@@ -50,6 +50,12 @@ def test_the_shipped_model_says_what_onnx_runtime_says(shipped: Backend, count: 
 
 
 @opencv5
+def test_opencv_has_nothing_to_warn_of(shipped: Backend, capfd: pytest.CaptureFixture[str]) -> None:
+    shipped.infer(*parity.two_view_input(40, seed=0))
+    assert capfd.readouterr() == ("", "")
+
+
+@opencv5
 def test_a_batch_says_what_its_pairs_say(shipped: Backend) -> None:
     pairs = [parity.two_view_input(40, seed) for seed in range(3)]
     logits, essential = shipped.infer(*(np.concatenate(arrays) for arrays in zip(*pairs)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from networks import TINY, sign_free_difference, tiny_network, two_view_batch
@@ -42,11 +43,15 @@ def network() -> MGCANet:
 @pytest.mark.parametrize("config", [TINY, dataclasses.replace(TINY, attention="point", stages=3, graph_expansion=2)])
 def test_permuted_matches_permute_logits_and_keep_the_geometry(config):
     network = tiny_network(config)
-    correspondences, attributes = two_view_batch(60, batch=2, seed=2)  # where rounding swaps no neighbours
     order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
-    once, again = network(correspondences, attributes), network(correspondences[:, order], attributes[:, order])
-    torch.testing.assert_close(again.logits, once.logits[:, order], atol=1e-2, rtol=1e-2)
-    assert sign_free_difference(again.essential, once.essential) < 1e-2
+    differences = []
+    for seed in range(9):
+        correspondences, attributes = two_view_batch(60, seed=seed)
+        once, again = network(correspondences, attributes), network(correspondences[:, order], attributes[:, order])
+        of_logits = (again.logits - once.logits[:, order]).abs().max() / once.logits.abs().max()
+        differences.append([float(of_logits), sign_free_difference(again.essential, once.essential)])
+    # Of some pairs rounding swaps two neighbours, on every processor of others.
+    assert max(np.median(differences, axis=0)) < 1e-2
 
 
 def test_a_batch_is_its_pairs(network):
