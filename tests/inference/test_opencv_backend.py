@@ -56,6 +56,14 @@ def test_opencv_has_nothing_to_warn_of(shipped: Backend, capfd: pytest.CaptureFi
 
 
 @opencv5
+@pytest.mark.parametrize("match", [[0.0, 0.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.1]])
+def test_matches_that_determine_no_pose_have_the_matrix_of_onnx_runtime(shipped: Backend, match: list[float]) -> None:
+    pair = np.tile(np.float32(match), (1, 50, 1)), np.zeros((1, 50, 8), dtype=np.float32)
+    expected = shared_backend(mgca_filter.model_path(), "onnxruntime").infer(*pair)[1]
+    np.testing.assert_allclose(shipped.infer(*pair)[1], expected, atol=1e-4)
+
+
+@opencv5
 def test_a_batch_says_what_its_pairs_say(shipped: Backend) -> None:
     pairs = [parity.two_view_input(40, seed) for seed in range(3)]
     logits, essential = shipped.infer(*(np.concatenate(arrays) for arrays in zip(*pairs)))
