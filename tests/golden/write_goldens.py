@@ -119,6 +119,7 @@ def synthetic_inputs() -> list[GoldenInput]:
     skew = make_scene("skew", 300, 60)
     zoomed = replace(skew, points2=(skew.points2 - K[:2, 2]) * 1.6 + K[:2, 2])
     sizes = {"size1": list(SIZE), "size2": list(SIZE)}
+    long = make_scene(right=450, wrong=250, seed=7)  # longer than what a rough run sees
     return [
         knn,
         from_scene("wide", wide, **camera),
@@ -159,6 +160,8 @@ def synthetic_inputs() -> list[GoldenInput]:
         from_scene("mirrored_scene", flipped(make_scene("wide")), **camera),
         from_scene("far_to_the_side", general, K1=SHORT.tolist(), dist1=FISHEYE),
         from_scene("small_motion", small_motion(), **camera),
+        from_scene("long", long, **camera),
+        from_scene("long_bare", long, "indices", **camera),
     ]
 
 
