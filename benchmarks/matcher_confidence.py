@@ -1,8 +1,8 @@
 """What would a matcher's own confidence add? ``python -m benchmarks.matcher_confidence BUNDLES [BUNDLES ...]``.
 
 A learned matcher scores its matches (bundles ``scene.*lightglue.npz``), and the networks take no such input. A logistic
-regression on both is the least that one which did would make of it. It is fitted on half of the scenes and tried on the
-other half, both ways: how well it tells right matches from wrong, and the poses that the filter finds on its answers.
+regression on both is the least that one which did would make of it, cross-validated over scenes: how well it tells
+right matches from wrong, and the poses that the filter finds on its answers.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.metrics import POSE_STATISTICS, true_matches
 from mgca_filter.export.calibration_fit import expected_calibration_error
-from mgca_filter.export.choice_fit import fit_logistic
+from mgca_filter.export.choice_fit import cross_validated
 from mgca_filter.inference import Backend, ModelMetadata, shared_backend
-from mgca_filter.inference.calibration import sigmoid
+from mgca_filter.inference.calibration import Calibration, sigmoid
 from mgca_filter.match_filter import MatchFilter, find_models
 from mgca_filter.tables import render_table
 
@@ -77,8 +77,7 @@ class Replaced:
 
 def log_odds(probabilities: Array) -> Array:
     """Logarithms of the odds, of neither certainty."""
-    p = np.clip(probabilities, _SURE, 1.0 - _SURE)
-    return np.asarray(np.log(p) - np.log1p(-p))
+    return Calibration().logits(np.clip(probabilities, _SURE, 1.0 - _SURE)).astype(np.float64)
 
 
 def read_pairs(options: argparse.Namespace) -> list[ListedPair]:
@@ -102,15 +101,13 @@ def read_pairs(options: argparse.Namespace) -> list[ListedPair]:
 
 
 def cross_fitted(pairs: Sequence[ListedPair], told: Sequence[str]) -> list[Array]:
-    """Probabilities of each pair's matches by the regression that was fitted on the other half of the scenes."""
-    half = {scene: number % 2 for number, scene in enumerate(sorted({one.scene for one in pairs}))}
-    fitted = []
-    for k in (0, 1):
-        seen = [one for one in pairs if half[one.scene] != k]
-        weight = np.concatenate([np.full(len(one.truth), 1.0 / len(one.truth)) for one in seen])  # each list alike
-        truth = np.concatenate([one.truth for one in seen])
-        fitted.append(fit_logistic(np.concatenate([one.features(told) for one in seen]), truth, weight / weight.mean()))
-    return [sigmoid(one.features(told) @ fitted[half[one.scene]][:-1] + fitted[half[one.scene]][-1]) for one in pairs]
+    """Probabilities of each pair's matches by a regression that saw no pair of its scene; each list weighs the same."""
+    counts = [len(one.truth) for one in pairs]
+    features = np.concatenate([one.features(told) for one in pairs])
+    truth = np.concatenate([one.truth for one in pairs])
+    weight = np.repeat(np.mean(counts) / np.array(counts), counts)
+    p = cross_validated(features, truth, weight, [one.scene for one in pairs for _ in one.truth])
+    return np.split(p, np.cumsum(counts)[:-1])
 
 
 def score_cells(name: str, pairs: Sequence[ListedPair], probabilities: Sequence[Array]) -> list[str]:
