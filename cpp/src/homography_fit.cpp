@@ -445,8 +445,9 @@ private:
     double best_support_ = 0.0;
 };
 
-/// Share of the wrong pairings of the same points that agree with a homography.
-double plane_chance_rate(const Correspondences& matches, const cv::Matx33d& H, double threshold) {
+/// Share of the wrong pairings of the same points that agree with a homography, at each multiple of the threshold.
+std::array<double, kThresholdFactors.size()> plane_chance_rates(const Correspondences& matches, const cv::Matx33d& H,
+                                                                double threshold) {
     const std::size_t step = std::max<std::size_t>(1, (matches.size() + kChanceRows - 1) / kChanceRows);
     const cv::Matx33d inverse = H.inv(cv::DECOMP_SVD);
     std::vector<cv::Point2d> first, second, mapped, back;
@@ -458,15 +459,21 @@ double plane_chance_rate(const Correspondences& matches, const cv::Matx33d& H, d
         back.emplace_back(from[0] / from[2], from[1] / from[2]);
     }
     const std::size_t count = first.size();
-    std::size_t agreeing = 0;
+    std::array<std::size_t, kThresholdFactors.size()> agreeing{};
     for (std::size_t i = 0; i < count; ++i) {
         for (std::size_t j = 0; j < count; ++j) {
+            if (i == j) {
+                continue;
+            }
             const cv::Point2d f = mapped[i] - second[j], b = first[i] - back[j];
             const double forward = f.dot(f), backward = b.dot(b);
-            agreeing += i != j && forward * backward < threshold * threshold * (forward + backward) ? 1 : 0;
+            for (std::size_t k = 0; k < agreeing.size(); ++k) {
+                const double limit = kThresholdFactors[k] * threshold;
+                agreeing[k] += forward * backward < limit * limit * (forward + backward) ? 1 : 0;
+            }
         }
     }
-    double largest = CV_PI * threshold * threshold;
+    double largest = 0.0;
     for (const int image : {0, 2}) {
         cv::Vec2d low(kInfinity, kInfinity), high(-kInfinity, -kInfinity);
         for (const Correspondence& match : matches) {
@@ -477,9 +484,14 @@ double plane_chance_rate(const Correspondences& matches, const cv::Matx33d& H, d
         }
         largest = std::max(largest, (high[0] - low[0]) * (high[1] - low[1]));
     }
-    const double expected = std::min(2.0 * CV_PI * threshold * threshold / largest, 0.5);
     const auto n = static_cast<double>(count);
-    return (static_cast<double>(agreeing) + 1.0) / (n * (n - 1.0) + 1.0 / expected);
+    std::array<double, kThresholdFactors.size()> rates{};
+    for (std::size_t k = 0; k < rates.size(); ++k) {
+        const double limit = kThresholdFactors[k] * threshold, disc = CV_PI * limit * limit;
+        const double expected = std::min(2.0 * disc / std::max(largest, disc), 0.5);
+        rates[k] = (static_cast<double>(agreeing[k]) + 1.0) / (n * (n - 1.0) + 1.0 / expected);
+    }
+    return rates;
 }
 
 /// Inliers of which no two lie in the same cell of either image: one blob is found several times.
@@ -639,9 +651,10 @@ PlaneSupport plane_support(const Correspondences& matches, const cv::Matx33d& H,
         heads.push_back(heads.back() / 2);
     }
     PlaneSupport support{0, kInfinity};
-    for (const double factor : kThresholdFactors) {
+    const auto rates = plane_chance_rates(matches, H, threshold);
+    for (std::size_t k = 0; k < rates.size(); ++k) {
+        const double factor = kThresholdFactors[k], rate = rates[k];
         const Mask witnesses = independent(matches, distances, factor * threshold, 2.0 * threshold);
-        const double rate = plane_chance_rate(matches, H, factor * threshold);
         if (factor == 1.0) {
             support.count = static_cast<int>(std::count(witnesses.begin(), witnesses.end(), 1));
         }
