@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 import torch
 from networks import TINY, sign_free_difference, tiny_network, two_view_batch
@@ -44,14 +43,16 @@ def network() -> MGCANet:
 def test_permuted_matches_permute_logits_and_keep_the_geometry(config):
     network = tiny_network(config)
     order = torch.randperm(60, generator=torch.Generator().manual_seed(0))
-    differences = []
-    for seed in range(9):
-        correspondences, attributes = two_view_batch(60, seed=seed)
+    held = 0
+    for seed in range(5):
+        correspondences, attributes = two_view_batch(60, batch=2, seed=seed)
         once, again = network(correspondences, attributes), network(correspondences[:, order], attributes[:, order])
-        of_logits = (again.logits - once.logits[:, order]).abs().max() / once.logits.abs().max()
-        differences.append([float(of_logits), sign_free_difference(again.essential, once.essential)])
-    # Of some pairs rounding swaps two neighbours, on every processor of others.
-    assert max(np.median(differences, axis=0)) < 1e-2
+        alike = torch.isclose(again.logits, once.logits[:, order], atol=1e-2, rtol=1e-2).all(1)
+        for pair in range(2):
+            E, other = again.essential[pair : pair + 1], once.essential[pair : pair + 1]
+            held += bool(alike[pair]) and sign_free_difference(E, other) < 1e-2
+    # Of a pair now and then rounding swaps two neighbours, on every processor of another one.
+    assert held >= 7, f"the law held for {held} of 10 pairs"
 
 
 def test_a_batch_is_its_pairs(network):
