@@ -87,6 +87,7 @@ VARIANTS = {
     "twice the samples": Variant(_drawing(2.0)),
     "without the twin under the plane": Variant(replace(PLAN, twins=False)),
     "without the last refinement": Variant(replace(PLAN, last_refinement=False)),
+    "the best explanation, not the expected best": Variant(replace(PLAN, expected=False)),
     "PoseLib among the sources": Variant(replace(PLAN, second=(*PLAN.second, POSELIB))),
     "MAGSAC alone": Variant(options=FilterOptions(method="magsac"), early_end=False),
     "PROSAC alone": Variant(options=FilterOptions(method="prosac"), early_end=False),
@@ -121,7 +122,9 @@ class ScoredPair:
 
     def error_deg(self, model: TwoViewModel | None) -> float:
         """Pose error, degrees; 180 without a model."""
-        return FAILURE_DEG if model is None else pose_error_deg(model.R, model.t, self.pair.R, self.pair.t)
+        if model is None:
+            return FAILURE_DEG
+        return pose_error_deg(model.answer.R, model.answer.t, self.pair.R, self.pair.t)
 
 
 def format_study(errors: Mapping[str, Mapping[str, FloatArray]], ms: Mapping[str, float]) -> str:
@@ -151,7 +154,7 @@ def format_study(errors: Mapping[str, Mapping[str, FloatArray]], ms: Mapping[str
 
 def origin_table(models: Sequence[TwoViewModel | None], errors_deg: Sequence[float]) -> str:
     """Where the answers came from, the most frequent first, and how often each is within 10 degrees."""
-    names = ["none" if model is None else f"{model.origin} ({model.ended})" for model in models]
+    names = ["none" if model is None else f"{model.answer.origin} ({model.ended})" for model in models]
     counts = {name: names.count(name) for name in dict.fromkeys(names)}
     body = []
     for name in sorted(counts, key=lambda name: -counts[name]):

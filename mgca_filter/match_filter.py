@@ -413,6 +413,7 @@ class MatchFilter:
 
     def _describe(self, job: _Job) -> dict[str, Any]:
         job.timings_ms["total"] = sum(job.timings_ms.values())
+        answer = None if job.model is None else job.model.answer
         return {
             "timings_ms": job.timings_ms,
             "backend": self._backends[-1].name,
@@ -423,9 +424,9 @@ class MatchFilter:
             "num_network_matches": len(job.rows),
             "network_rows": job.rows,
             "network_essential": job.network_essential,
-            "fitted_essential": None if job.model is None else job.model.E,
-            "origin": None if job.model is None else job.model.origin,
-            "ended": None if job.model is None else job.model.ended,
+            "fitted_essential": None if answer is None else answer.E,
+            "origin": None if answer is None else answer.origin,
+            "ended": None if answer is None else answer.ended,
         }
 
 

@@ -72,8 +72,10 @@ class FilterResult:
             ``network_rows`` (those that entered the first network), ``num_accepted`` (those above the decision
             threshold), ``network_essential`` (3, 3) or None as the last network gave it, ``fitted_essential`` (3, 3) or
             None as the robust fit left it, before the verdict, its ``origin`` (name of the source that proposed it:
-            "list", "network", "accepted", "score order", …, "plane"), where the search ``ended`` ("before the network",
-            where the scores come from the residuals, "first sources" or "all sources"). Where they were measured:
+            "list", "network", "accepted", "score order", …, "plane"; or "expected best", where many poses explain the
+            matches about as well and the answer is the one expected nearest to the truth), where the search ``ended``
+            ("before the network", where the scores come from the residuals, "first sources" or "all sources"). Where
+            they were measured:
             ``support`` (number of accepted matches that agree), ``log10_false_alarms``, ``translation_sigma_deg``
             (standard deviation of the direction of translation), ``homography`` (the same as ``H``), ``mirrored``
             (True where one of the images was flipped: there is no pose, and H mirrors where the pair is planar),

@@ -22,8 +22,6 @@ constexpr double kBackgroundLowPx = 6.0, kBackgroundHighPx = 18.0;
 // Beyond this angle two hypotheses are alternatives and not the same answer.
 constexpr double kAlternativeDeg = 5.0;
 constexpr std::array<double, 3> kAgreementDeg{2.0, 5.0, 10.0};
-// Half a pixel is the noise of SIFT's keypoints, more than enough; scales of the likelihood multiply it.
-constexpr double kNoisePx = 0.5;
 // Shares of right matches in a group, and rounds in which they are found.
 constexpr double kLeastShare = 1e-3, kLargestShare = 0.99;
 constexpr int kShareRounds = 8;
@@ -82,21 +80,6 @@ std::vector<double> supports(const std::vector<Residuals>& residuals, const std:
         sums.push_back(sum);
     }
     return sums;
-}
-
-/// Logarithm of each hypothesis' mean support relative to the best supported one's, at several widths.
-std::vector<double> log_relative_support(const std::vector<Residuals>& residuals, const std::vector<double>& weights) {
-    std::vector<double> mean(residuals.size(), 0.0);
-    const double total = std::accumulate(kSupportWeights.begin(), kSupportWeights.end(), 0.0);
-    for (std::size_t k = 0; k < kSupportPx.size(); ++k) {
-        const std::vector<double> sums = supports(residuals, weights, kSupportPx[k]);
-        const double largest = std::max(*std::max_element(sums.begin(), sums.end()), kTiny);
-        for (std::size_t h = 0; h < sums.size(); ++h) {
-            mean[h] += kSupportWeights[k] / total * sums[h] / largest;
-        }
-    }
-    std::transform(mean.begin(), mean.end(), mean.begin(), [](double value) { return std::log(std::max(value, kTiny)); });
-    return mean;
 }
 
 std::vector<double> checked(const Json& values, const char* name, std::size_t count) {
@@ -243,6 +226,23 @@ std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& r
     return likelihoods;
 }
 
+std::vector<double> support_bonus(const std::vector<Residuals>& residuals, const std::vector<double>& weights,
+                                  const Coefficients& coefficients, std::size_t matches) {
+    std::vector<double> mean(residuals.size(), 0.0);
+    const double total = std::accumulate(kSupportWeights.begin(), kSupportWeights.end(), 0.0);
+    for (std::size_t k = 0; k < kSupportPx.size(); ++k) {
+        const std::vector<double> sums = supports(residuals, weights, kSupportPx[k]);
+        const double largest = std::max(*std::max_element(sums.begin(), sums.end()), kTiny);
+        for (std::size_t h = 0; h < sums.size(); ++h) {
+            mean[h] += kSupportWeights[k] / total * sums[h] / largest;
+        }
+    }
+    const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(matches), 1.5);
+    std::transform(mean.begin(), mean.end(), mean.begin(),
+                   [factor](double value) { return factor * std::log(std::max(value, kTiny)); });
+    return mean;
+}
+
 Judgement judge_hypotheses(const Correspondences& matches, const std::optional<std::vector<double>>& scores,
                            const std::vector<Hypothesis>& hypotheses, double focal_px,
                            const std::vector<Pose>& network_poses, const Coefficients& coefficients) {
@@ -290,11 +290,10 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     for (std::size_t i = 0; i < count; ++i) {
         counted[i] *= counts[i];
     }
-    const std::vector<double> relative = log_relative_support(residuals, counted);
-    const std::vector<double> whole_relative = log_relative_support(residuals, weights);
-    const double factor = coefficients.support_weight[0] * std::pow(static_cast<double>(count), 1.5);
+    const std::vector<double> bonus = support_bonus(residuals, counted, coefficients, count);
+    const std::vector<double> whole_bonus = support_bonus(residuals, weights, coefficients, count);
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
-        merit[h] += factor * relative[h];
+        merit[h] += bonus[h];
     }
     // Crowded matches count less for one answer against another; between hypotheses of one answer, and near ties, all
     // matches tell the best.
@@ -305,8 +304,7 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     for (std::size_t h = 0; h < number_of_hypotheses; ++h) {
         const double angle = pose_angle_deg(hypotheses[h].pose, hypotheses[answer].pose);
         if (angle < kAlternativeDeg || merit[h] > merit[answer] - kTie) {
-            whole_merit[h] =
-                log_likelihood(residuals[h], odds, scale, coefficients, once_each) + factor * whole_relative[h];
+            whole_merit[h] = log_likelihood(residuals[h], odds, scale, coefficients, once_each) + whole_bonus[h];
         }
     }
     const std::size_t chosen = position_of_largest(whole_merit);

@@ -46,6 +46,8 @@ constexpr std::size_t kFeatureCount = static_cast<std::size_t>(Feature::count);
 
 // Matches within this distance are explained.
 constexpr double kInlierPx = 1.0;
+// Half a pixel is the noise of SIFT's keypoints, more than enough; scales of the likelihood multiply it.
+constexpr double kNoisePx = 0.5;
 
 /// Coefficients by name, from the model file.
 struct Coefficients {
@@ -94,6 +96,12 @@ std::vector<double> independent_counts(const Correspondences& matches, const std
 std::vector<std::vector<double>> log_likelihoods(const std::vector<Residuals>& residuals,
                                                  const std::vector<double>& probability,
                                                  const Coefficients& coefficients, const std::vector<double>& counts);
+
+/// What the support adds to the log-likelihood of each hypothesis: 0 for one that has the most at every distance.
+///
+/// @param weights what each match counts. matches: how many there are, where these are some of them.
+std::vector<double> support_bonus(const std::vector<Residuals>& residuals, const std::vector<double>& weights,
+                                  const Coefficients& coefficients, std::size_t matches);
 
 /// Probability that a match of a score is right as the likelihood believes it.
 double score_prior(double score, const Coefficients& coefficients);

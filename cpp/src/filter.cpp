@@ -275,8 +275,9 @@ private:
         result_.num_accepted = static_cast<int>(std::count_if(result_.logits.begin(), result_.logits.end(),
                                                               [&](float logit) { return logit > threshold; }));
         if (model_) {
-            result_.fitted_essential = model_->E;
-            result_.origin = model_->origin;
+            const detail::TwoViewModel answer = model_->answer();
+            result_.fitted_essential = answer.E;
+            result_.origin = answer.origin;
             result_.ended = model_->ended;
             if (verdict.t) {
                 result_.confidence = model_->confidence;

@@ -22,9 +22,6 @@ constexpr double kReach = 12.0;
 constexpr double kLinearDeg = 0.1;
 constexpr std::size_t kRings = 28, kSpokes = 12, kSpreadRows = 200;
 
-using Vec5d = cv::Vec<double, 5>;
-using Matx55d = cv::Matx<double, 5, 5>;
-
 /// What a pose leaves of one match.
 struct SampsonTerm {
     double r0, r1, r2;     // ray of image 1, in the second camera
@@ -58,12 +55,6 @@ std::array<cv::Vec3d, 2> tangent_basis(const cv::Vec3d& t) {
     axis[static_cast<int>(smallest - t.val)] = 1.0;
     const cv::Vec3d first = cv::normalize(t.cross(axis));
     return {first, t.cross(first)};
-}
-
-Pose apply_step(const Pose& pose, const Vec5d& step) {
-    const auto basis = tangent_basis(pose.t);
-    return {rotation_from_vector({step[0], step[1], step[2]}) * pose.R,
-            cv::normalize(pose.t + step[3] * basis[0] + step[4] * basis[1])};
 }
 
 /// What a match adds to the cost, and how much it counts in the squares that stand for the cost near by.
@@ -248,6 +239,17 @@ double direction_spread_deg(const Correspondences& inliers, const Pose& pose, do
 
 double truncated_cost(const Correspondences& matches, const Pose& pose, double threshold) {
     return cost_of(matches, pose, truncated_at(threshold));
+}
+
+Matx55d pose_information(const Correspondences& matches, const Pose& pose, const std::vector<double>& weights) {
+    const auto weighted = [&](std::size_t i, double) { return Loss{0.0, weights[i]}; };
+    return NormalEquations(matches, pose, weighted).hessian;
+}
+
+Pose apply_step(const Pose& pose, const Vec5d& step) {
+    const auto basis = tangent_basis(pose.t);
+    return {rotation_from_vector({step[0], step[1], step[2]}) * pose.R,
+            cv::normalize(pose.t + step[3] * basis[0] + step[4] * basis[1])};
 }
 
 cv::Matx33d rotation_from_vector(const cv::Vec3d& vector) {

@@ -14,6 +14,9 @@ namespace mgca::detail {
 
 constexpr int kMinRefinedInliers = 6;
 
+using Vec5d = cv::Vec<double, 5>;
+using Matx55d = cv::Matx<double, 5, 5>;
+
 /// Refine a pose on the matches within the threshold (Sampson distance, normalised), which are chosen anew in every
 /// round; the truncated cost never rises.
 Pose refine_pose(const Correspondences& matches, const Pose& start, double threshold, int rounds = 10);
@@ -39,6 +42,12 @@ double pose_uncertainty_deg(const Correspondences& inliers, const Pose& pose, do
 /// from the likelihoods of directions all around, for over a few pixels of parallax the cost is no paraboloid. What the
 /// rotation takes up of the same residuals is accounted for.
 double direction_uncertainty_deg(const Correspondences& inliers, const Pose& pose, double noise);
+
+/// Information that weighted matches hold on a pose: their squared residuals' curvature by the five steps.
+Matx55d pose_information(const Correspondences& matches, const Pose& pose, const std::vector<double>& weights);
+
+/// The pose after a step: a rotation vector on the left of R, then two moves across t.
+Pose apply_step(const Pose& pose, const Vec5d& step);
 
 /// Rotation about a vector by its length in radians (Rodrigues).
 cv::Matx33d rotation_from_vector(const cv::Vec3d& vector);

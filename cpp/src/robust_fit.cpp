@@ -1,7 +1,8 @@
 #include "robust_fit.hpp"
 
-#include "statistics.hpp"
+#include "bayes_estimate.hpp"
 #include "pose_refinement.hpp"
+#include "statistics.hpp"
 
 #include <algorithm>
 #include <array>
@@ -17,6 +18,10 @@ constexpr double kSameDeg = 0.3, kTwinDeg = 2.0;
 constexpr double kPromising = 0.3, kCertain = 0.7;
 // A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
 constexpr double kTwinShare = 0.5;
+// Of fewer matches than this the best explanation is best by luck. From this angle on the pose that is expected nearest to
+// the truth is another answer; else the refined one is finer.
+constexpr std::size_t kFewMatches = 200;
+constexpr double kExpectedDeg = 2.0;
 
 constexpr Proposal kList{"list", Family::list_uniform, Source::listed, Estimator::magsac, 0.5, 300, 0, 0.0, true};
 constexpr Proposal kListCoarse{
@@ -77,6 +82,17 @@ std::vector<double> select(const std::vector<double>& values, const Mask& mask) 
 }
 
 }  // namespace
+
+TwoViewModel TwoViewModel::answer() const {
+    TwoViewModel answer = *this;
+    if (expected) {
+        answer.pose = *expected;
+        answer.M = answer.E = essential_from_pose(*expected);
+        answer.origin = "expected best";
+        answer.expected.reset();
+    }
+    return answer;
+}
 
 Search::Search(Evidence evidence, const Coefficients& coefficients, const Options& options)
     : coefficients_(coefficients), options_(options) {
@@ -153,7 +169,7 @@ std::optional<TwoViewModel> Search::with_network(Evidence evidence) {
     if (!poses_.empty()) {
         propose_twins();
     }
-    return refined(chosen(ended));
+    return with_expected(refined(chosen(ended)));
 }
 
 void Search::take(Evidence evidence) {
@@ -309,6 +325,26 @@ std::optional<TwoViewModel> Search::refined(std::optional<TwoViewModel> model) c
     }
     model->pose = refine_pose_by_weights(still, model->pose, scale, counted, kLastReachPx / evidence_.focal_px);
     model->M = model->E = essential_from_pose(model->pose);
+    return model;
+}
+
+std::optional<TwoViewModel> Search::with_expected(std::optional<TwoViewModel> model) const {
+    // Nothing is asked of many matches, nor of an answer that is sure, or hopeless.
+    const double certain = coefficients_.settled[1], hopeless = coefficients_.settled[2];
+    if (!model || judged_.size() >= kFewMatches ||
+        !(hopeless < *model->confidence && *model->confidence <= certain)) {
+        return model;
+    }
+    std::vector<Pose> hypotheses;
+    for (const Found& found : poses_) {
+        hypotheses.push_back(found.pose);
+    }
+    const std::vector<double> scores = select(evidence_.network->scores, evidence_.once);
+    const auto found =
+        expected_best(judged_, scores, hypotheses, model->judgement->scale, evidence_.focal_px, coefficients_);
+    if (found && pose_angle_deg(*found, model->pose) >= kExpectedDeg) {
+        model->expected = found;
+    }
     return model;
 }
 

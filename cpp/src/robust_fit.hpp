@@ -34,6 +34,12 @@ struct TwoViewModel {
     std::string ended;   // "before the network", "first sources" or "all sources"
     std::optional<double> confidence;     // that the pose is within 10 degrees; nothing with guessed intrinsics
     std::optional<Judgement> judgement;   // the measurements behind the choice; likewise
+    // The pose that is expected to lie nearer to the truth than the best explanation of the matches, which the others are;
+    // nothing where that is no other answer.
+    std::optional<Pose> expected = std::nullopt;
+
+    /// What is answered where the matches hold a pose at all: the same with the expected one, where there is one.
+    TwoViewModel answer() const;
 };
 
 /// Hypotheses of a pair as they come, refined, and the choice among them.
@@ -71,6 +77,7 @@ private:
     const Judgement& judge();
     std::optional<TwoViewModel> chosen(const char* ended);
     std::optional<TwoViewModel> refined(std::optional<TwoViewModel> model) const;
+    std::optional<TwoViewModel> with_expected(std::optional<TwoViewModel> model) const;
     std::optional<TwoViewModel> fundamental();
 
     const Coefficients& coefficients_;

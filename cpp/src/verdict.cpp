@@ -316,7 +316,7 @@ Verdict judge(const PairInput& pair, const std::optional<TwoViewModel>& model, c
     const double residual = median(sampson_distances(inliers, model->M));
     const double noise = std::max(kToSigma * residual, kLeastNoisePx / pair.focal_px());
     verdict.translation_sigma_deg = direction_uncertainty_deg(inliers, model->pose, noise);
-    keep_model(pair, *model, mask_threshold_px, verdict);
+    keep_model(pair, model->answer(), mask_threshold_px, verdict);
     if (suspicious) {
         verdict.status = Status::suspicious_intrinsics;
         return verdict;

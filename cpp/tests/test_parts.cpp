@@ -1,6 +1,7 @@
 // Laws of the parts behind the public header.
 
 #include "attributes.hpp"
+#include "bayes_estimate.hpp"
 #include "calibration.hpp"
 #include "check.hpp"
 #include "choice.hpp"
@@ -405,6 +406,27 @@ void the_likelier_hypothesis_is_chosen() {
                                          "score_trust: expected 3");
 }
 
+void the_expected_best_lies_among_what_the_matches_hold() {
+    const Coefficients c = coefficients();
+    Correspondences matches = draw_matches(kPose, 60, 0.3, 9);
+    const Correspondences wrong = draw_wrong(30, 10);
+    matches.insert(matches.end(), wrong.begin(), wrong.end());
+    std::vector<double> scores(90, 0.05);
+    std::fill(scores.begin(), scores.begin() + 60, 0.9);
+    const Pose refined = refine_pose(matches, kPose, 1.0 / kFocal);
+    const Pose other{rotation_from_vector({0.3, 0.0, 0.1}), {0.0, 0.0, 1.0}};
+    const auto answer = expected_best(matches, scores, {other, refined}, 1.0, kFocal, c);
+    if (check::that(answer.has_value(), "an expected best")) {
+        check::near(pose_angle_deg(*answer, refined), 0.0, 0.5, "the one that the matches hold");
+        check::near(cv::norm(answer->R * answer->R.t() - cv::Matx33d::eye()), 0.0, 1e-9, "a rotation");
+        check::near(cv::norm(answer->t), 1.0, 1e-12, "a direction");
+        const auto again = expected_best(matches, scores, {refined, other}, 1.0, kFocal, c);
+        check::near(pose_angle_deg(*answer, again.value_or(other)), 0.0, 1e-6, "whatever the order");
+    }
+    check::that(!expected_best(draw_wrong(40, 1), std::vector<double>(40, 0.5), {other}, 1.0, kFocal, c),
+                "nothing where the matches hold nothing");
+}
+
 void residuals_become_scores() {
     const Correspondences matches = draw_matches(kPose, 60, 0.3, 11);
     Correspondences all = matches;
@@ -504,6 +526,7 @@ int main() {
     mirrors_are_told_and_mapped_where_that_is_allowed();
     a_loose_direction_has_a_wide_spread();
     the_likelier_hypothesis_is_chosen();
+    the_expected_best_lies_among_what_the_matches_hold();
     residuals_become_scores();
     probabilities_and_logits_are_inverse();
     networks_are_heard_alike();

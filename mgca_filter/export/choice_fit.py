@@ -168,7 +168,7 @@ def scored_evidence(match_filter: MatchFilter, pair: MatchPair, prepared: PairIn
 def _sample(model: TwoViewModel | None, pose: tuple[Array, Array] | None, group: str, early: bool) -> Sample | None:
     if model is None or model.judgement is None:
         return None
-    error = FAILURE_DEG if pose is None else pose_error_deg(model.R, model.t, *pose)
+    error = FAILURE_DEG if pose is None else pose_error_deg(model.answer.R, model.answer.t, *pose)
     names = EARLY_FEATURES if early else FEATURES
     features = np.array([model.judgement.features[name] for name in names])
     return Sample(features, error < RIGHT_DEG, group, early)

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.epipolar import cross_matrix, homogeneous_columns, sampson_distance
+from ..geometry.epipolar import cross_matrices, homogeneous_columns, sampson_distance
 from ..geometry.pose_refinement import pose_uncertainty_deg
 
 Array = NDArray[np.float64]
@@ -167,7 +167,7 @@ class Judgement:
 
 def measure_residuals(correspondences: Array, R: Array, t: Array, focal_px: float) -> Residuals:
     """Residuals of poses R (H, 3, 3), t (H, 3) on matches (N, 4) of the normalised image planes."""
-    E = np.stack([cross_matrix(one) for one in t]) @ R
+    E = cross_matrices(t) @ R
     distance_px = sampson_distance(correspondences, E) * focal_px
     return Residuals(distance_px, lie_behind(correspondences, R, t, focal_px))
 
@@ -240,12 +240,15 @@ def log_likelihoods(
     return np.stack(columns, axis=1)
 
 
-def _support_bonus(residuals: Residuals, weights: Array, coefficients: Coefficients) -> Array:
+def support_bonus(
+    residuals: Residuals, weights: Array, coefficients: Coefficients, matches: int | None = None
+) -> Array:
     """What the support (H,) adds to the log-likelihood: 0 for a hypothesis that has the most at every distance.
 
     Args:
         weights: (N,) what each match counts.
         coefficients: ``support_weight``, of the logarithm, times the number of matches to the power of one and a half.
+        matches: that number, where these N are some of them; None = N.
     """
     front = ~residuals.behind
     total = np.zeros(len(front))
@@ -253,7 +256,8 @@ def _support_bonus(residuals: Residuals, weights: Array, coefficients: Coefficie
         support = (np.maximum(1.0 - (residuals.distance_px / reach) ** 2, 0.0) * front) @ weights
         total += weight * support / max(float(support.max()), _TINY)
     relative = np.maximum(total / sum(_SUPPORT_WEIGHTS), _TINY)
-    return np.asarray(coefficients["support_weight"][0] * len(weights) ** 1.5 * np.log(relative))
+    factor = coefficients["support_weight"][0] * (len(weights) if matches is None else matches) ** 1.5
+    return np.asarray(factor * np.log(relative))
 
 
 def prior(scores: Array, coefficients: Coefficients) -> Array:
@@ -296,12 +300,12 @@ def judge(
     # One scale for all hypotheses: that of the most likely one.
     column = int(np.argmax(by_scale.max(axis=0)))
     likelihood, plain = by_scale[:, column], plain_by_scale[:, column]
-    merit = likelihood + _support_bonus(residuals, weights * counts, coefficients)
+    merit = likelihood + support_bonus(residuals, weights * counts, coefficients)
     answer = int(np.argmax(merit))
     # Crowded matches count less for one answer against another; between hypotheses of one answer, and near ties, all
     # matches tell the best.
     alike = (_angles_to(hypotheses, answer) < ALTERNATIVE_DEG) | (merit > merit[answer] - TIE)
-    whole = of_both[:, column, 1] + _support_bonus(residuals, weights, coefficients)
+    whole = of_both[:, column, 1] + support_bonus(residuals, weights, coefficients)
     chosen = int(np.argmax(np.where(alike, whole, -np.inf)))
     support = (np.maximum(1.0 - distance**2, 0.0) * front) @ weights
     angles = _angles_to(hypotheses, chosen)

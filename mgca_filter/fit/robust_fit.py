@@ -18,6 +18,7 @@ from ..geometry.epipolar import (
     decompose_essential,
     essential_from_pose,
     parallax,
+    pose_error_deg,
     project_to_essential,
     sampson_distance,
 )
@@ -25,6 +26,7 @@ from ..geometry.pose_refinement import refine_pose, refine_pose_by_weights
 from ..inputs.options import FilterOptions
 from ..inputs.pair import PairInput
 from . import choice, sources
+from .bayes_estimate import expected_best
 from .choice import Coefficients, Hypotheses, Judgement, Residuals
 from .estimators import EstimatorOptions
 from .evidence import ACCEPTED_SCORE, MIN_MATCHES, Evidence, listed_rows
@@ -45,6 +47,11 @@ PROMISING, CERTAIN = 0.3, 0.7
 # A twin that explains less than this share of what the best pose does within so many pixels, before it is refined, is
 # no alternative.
 TWIN_SHARE, TWIN_PX = 0.5, 2.0
+# Of fewer matches than this the best explanation is best by luck. From this angle on the pose that is expected nearest
+# to the truth is another answer; else the refined one is finer.
+FEW_MATCHES, EXPECTED_DEG = 200, 2.0
+EXPECTED = "expected best"
+"""Origin of an answer that no source proposed."""
 
 # What needs no network; then what uses it; then what is still tried where those do not settle it.
 BEFORE_NETWORK = (
@@ -80,6 +87,7 @@ class Plan:
         twins: propose the twin that the dominant plane allows as well.
         settle: leave the second out where the first agree.
         last_refinement: refine what was chosen once more, on all matches by what each is worth.
+        expected: where the choice is unsure, answer with the pose that is expected to lie nearest to the truth.
     """
 
     before: tuple[Proposal, ...] = BEFORE_NETWORK
@@ -88,6 +96,7 @@ class Plan:
     twins: bool = True
     settle: bool = True
     last_refinement: bool = True
+    expected: bool = True
 
 
 PLAN = Plan()
@@ -106,6 +115,8 @@ class TwoViewModel:
         confidence: probability that the pose is within 10 degrees; None with guessed intrinsics.
         judgement: the measurements behind the choice; None likewise.
         plane: homography (3, 3) of the dominant plane among its inliers, where it was looked for; else None.
+        expected: R, t that are expected to lie nearer to the truth than the best explanation of the matches, which is
+            what M, E, R and t are; None where that is no other answer.
     """
 
     M: Array
@@ -117,6 +128,16 @@ class TwoViewModel:
     confidence: float | None = None
     judgement: Judgement | None = None
     plane: Array | None = None
+    expected: tuple[Array, Array] | None = None
+
+    @property
+    def answer(self) -> TwoViewModel:
+        """What is answered where the matches hold a pose at all: the same with the expected one, where there is one."""
+        if self.expected is None:
+            return self
+        R, t = self.expected
+        E = essential_from_pose(R, t)
+        return replace(self, M=E, E=E, R=R, t=t, origin=EXPECTED, expected=None)
 
 
 @dataclass(frozen=True)
@@ -203,7 +224,7 @@ class Search:
             self._propose((POSELIB,) if poselib else ())
         if self._poses:
             self._propose_twins()
-        return self._refined(self.current(ended))
+        return self._expected(self._refined(self.current(ended)))
 
     def _take(self, evidence: Evidence) -> None:
         self._evidence, self._judgement = evidence, None
@@ -348,6 +369,26 @@ class Search:
         )
         E = essential_from_pose(R, t)
         return replace(model, M=E, E=E, R=R, t=t)
+
+    def _expected(self, model: TwoViewModel | None) -> TwoViewModel | None:
+        """The model, and the pose that is expected to lie nearest to the truth, where that is another answer.
+
+        Nothing is asked of many matches, nor of an answer that is sure, or hopeless.
+        """
+        evidence, scores = self._evidence, self._evidence.scores
+        if model is None or model.judgement is None or model.confidence is None or scores is None:
+            return model
+        if len(self._judged) >= FEW_MATCHES:
+            return model
+        _, certain, hopeless = self._coefficients["settled"]
+        if not self._plan.expected or not hopeless < model.confidence <= certain:
+            return model
+        R, t = np.stack([pose.R for pose in self._poses]), np.stack([pose.t for pose in self._poses])
+        scale = model.judgement.scale
+        found = expected_best(self._judged, scores[evidence.once], R, t, scale, evidence.focal_px, self._coefficients)
+        if found is None or pose_error_deg(*found, model.R, model.t) < EXPECTED_DEG:
+            return model
+        return replace(model, expected=found)
 
     def _fundamental(self) -> TwoViewModel | None:
         """The fundamental matrix of a pair without intrinsics, and the pose that the guessed ones make of it.

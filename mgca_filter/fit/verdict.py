@@ -116,7 +116,7 @@ def judge(
     residual = float(np.median(sampson_distance(inliers, model.M)))
     noise = max(degeneracy.TO_SIGMA * residual, degeneracy.LEAST_NOISE_PX / pair.focal_px)
     info["translation_sigma_deg"] = direction_uncertainty_deg(inliers, model.R, model.t, noise)
-    verdict = _keep_model(pair, model, mask_threshold_px, info)
+    verdict = _keep_model(pair, model.answer, mask_threshold_px, info)
     if suspicious:
         return replace(verdict, status=Status.SUSPICIOUS_INTRINSICS)
     if doubtful:

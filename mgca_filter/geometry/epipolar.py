@@ -18,6 +18,14 @@ def cross_matrix(t: ArrayLike) -> FloatArray:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+_OF_AXES = np.stack([cross_matrix(axis) for axis in np.eye(3)]).reshape(3, 9)
+
+
+def cross_matrices(t: FloatArray) -> FloatArray:
+    """The same (N, 3, 3) of many (N, 3)."""
+    return np.asarray((t @ _OF_AXES).reshape(-1, 3, 3))
+
+
 def essential_from_pose(R: ArrayLike, t: ArrayLike) -> FloatArray:
     """Essential matrix (3, 3) of the relative pose ``X2 = R X1 + t``, of unit Frobenius norm."""
     E: FloatArray = cross_matrix(t) @ np.asarray(R, dtype=np.float64)

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .epipolar import cross_matrix, homogeneous_columns
+from .epipolar import cross_matrices, cross_matrix, homogeneous_columns
 from .least_squares import promises
 from .matrix_product import product
 
@@ -30,7 +30,7 @@ MIN_INLIERS = 6
 # Below this the cost of directions is a paraboloid around the best. Rings and spokes that others are tried on.
 _LINEAR_DEG, _RINGS, _SPOKES, _SPREAD_ROWS = 0.1, 28, 12, 200
 # What small turns about the axes make of a vector: its products with them.
-_TURNS = np.stack([cross_matrix(axis) for axis in np.eye(3)])  # (3, 3, 3)
+_TURNS = cross_matrices(np.eye(3))
 # Matches farther than this many thresholds from the pose that refinement starts at are left out of it.
 REACH = 12.0
 
@@ -278,3 +278,13 @@ def apply_step(R: Array, t: Array, step: Array) -> tuple[Array, Array]:
     """The pose after a step (5,): a rotation vector on the left of R, then two moves across ``t``."""
     moved = t + step[3:] @ tangent_basis(t)
     return rotation_from_vector(step[:3]) @ R, moved / sqrt(moved @ moved)
+
+
+def apply_steps(R: Array, t: Array, steps: Array) -> tuple[Array, Array]:
+    """The poses R (S, 3, 3), t (S, 3) after each of some steps (S, 5) alone; see :func:`apply_step`."""
+    angle = np.sqrt(np.einsum("si,si->s", steps[:, :3], steps[:, :3]))
+    axis = steps[:, :3] / np.maximum(angle, np.finfo(np.float64).tiny)[:, None]
+    K = cross_matrices(axis)
+    turns = np.eye(3) + np.sin(angle)[:, None, None] * K + (1.0 - np.cos(angle))[:, None, None] * (K @ K)
+    moved = t + steps[:, 3:] @ tangent_basis(t)
+    return turns @ R, moved / np.linalg.norm(moved, axis=1, keepdims=True)

@@ -237,7 +237,7 @@ def test_on_long_lists_support_counts_beside_the_likelihood() -> None:
     poses = Hypotheses(np.stack([scene.R, tilted]), np.stack([scene.t] * 2), np.arange(2))
     assert judged(scene, poses, np.full(2000, 0.9)).chosen == 0
     bonus = [
-        choice._support_bonus(
+        choice.support_bonus(
             measure_residuals(normalized(scene)[:count], poses.R, poses.t, FOCAL), np.full(count, 0.9), COEFFICIENTS
         )
         for count in (100, 2000)

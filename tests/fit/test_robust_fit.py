@@ -312,6 +312,45 @@ def test_where_hope_is_lost_the_second_are_left_out(runs: list) -> None:
     assert len(runs) == len(FIRST) - 1
 
 
+def few_and_noisy(seed: int) -> Scene:
+    return make_scene("planar", right=60, wrong=30, noise_px=2.5, seed=seed)
+
+
+def test_of_few_matches_the_expected_best_is_answered_and_the_best_explanation_is_judged() -> None:
+    differing = 0
+    for seed in range(12):
+        scene = few_and_noisy(seed)
+        model = late(scene)
+        plain = late(scene, plan=replace(PLAN, expected=False))
+        for name in ("M", "E", "R", "t", "origin", "ended", "confidence"):
+            np.testing.assert_array_equal(getattr(model, name), getattr(plain, name))
+        assert plain.expected is None
+        assert plain.answer is plain
+        if model.expected is None:
+            assert model.answer is model
+            continue
+        differing += 1
+        answer = model.answer
+        assert answer.origin == robust_fit.EXPECTED
+        assert answer.answer is answer
+        np.testing.assert_array_equal(answer.E, essential_from_pose(answer.R, answer.t))
+        assert pose_error_deg(answer.R, answer.t, model.R, model.t) >= robust_fit.EXPECTED_DEG
+    assert differing >= 3
+
+
+def test_nothing_is_expected_of_many_matches_nor_of_a_sure_or_hopeless_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr(robust_fit, "expected_best", lambda rows, *others: asked.append(len(rows)))
+    late(few_and_noisy(0))
+    assert asked == [90]
+    late(make_scene("planar", right=60, wrong=200, noise_px=2.5))
+    late(make_scene(right=100, wrong=20))
+    late(make_scene(right=0, wrong=150))
+    late(few_and_noisy(0), FilterOptions(method="magsac"))
+    late(few_and_noisy(0), calibrated=False)
+    assert asked == [90]
+
+
 @pytest.mark.parametrize("calibrated", [True, False])
 @pytest.mark.parametrize("method", FITS)
 def test_options_reach_every_run(method: str, calibrated: bool, runs: list) -> None:

@@ -11,6 +11,7 @@ from mgca_filter.geometry.epipolar import homogeneous_columns, pose_error_deg, t
 from mgca_filter.geometry.pose_refinement import (
     SampsonTerms,
     apply_step,
+    apply_steps,
     costs_of_directions,
     direction_uncertainty_deg,
     pose_uncertainty_deg,
@@ -90,6 +91,16 @@ def test_derivatives_are_those_of_the_residuals_at_exact_points() -> None:
         np.testing.assert_allclose(
             terms(rows, *apply_step(exact.R, exact.t, step * unit)).residual / step, J[axis], atol=1e-4
         )
+
+
+def test_many_steps_at_once_are_those_one_by_one() -> None:
+    scene = make_scene()
+    steps = np.vstack([np.zeros(5), np.random.default_rng(0).normal(0.0, 0.5, (20, 5)), [0.0, 0.0, 0.0, 0.3, -0.2]])
+    R, t = apply_steps(scene.R, scene.t, steps)
+    for k, step in enumerate(steps):
+        expected = apply_step(scene.R, scene.t, step)
+        np.testing.assert_allclose(R[k], expected[0], atol=1e-12)
+        np.testing.assert_allclose(t[k], expected[1], atol=1e-12)
 
 
 def test_costs_of_directions_are_those_of_poses_turned_as_each_likes_best() -> None:

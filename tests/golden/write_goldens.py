@@ -162,6 +162,7 @@ def synthetic_inputs() -> list[GoldenInput]:
         from_scene("small_motion", small_motion(), **camera),
         from_scene("long", long, **camera),
         from_scene("long_bare", long, "indices", **camera),
+        *(from_scene(f"loose_{kind}", loose(kind), **camera) for kind in ("planar", "skew")),
     ]
 
 
@@ -180,6 +181,11 @@ def small_motion() -> Any:
 def faint(right: int) -> Any:
     """Few right matches among many wrong ones."""
     return make_scene("general", right, 300, noise_px=0.6, seed=4)
+
+
+def loose(kind: str) -> Any:
+    """Few matches and much noise: many poses explain them about as well."""
+    return make_scene(kind, *((60, 30, 2.5, 0) if kind == "planar" else (40, 20, 2.0, 18)))
 
 
 def normalised(name: str, scene: Any) -> GoldenInput:
