@@ -2,7 +2,8 @@
 
 The networks score every pair once; then the fit runs as users get it, and with one thing changed at a time. Each row
 has its difference to the fit as it is, on the same pairs and the same draws of the bootstrap. A second table tells
-where the answers came from, and how often each origin is right.
+where the answers came from, and how often each origin is right. ``--kinds`` makes lists of the raw matches first, as
+users do; every scene counts once for each detector and kind. ``--variants`` runs some rows alone.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from mgca_filter.inputs.pair import prepare_pair
 from mgca_filter.match_filter import MatchFilter
 from mgca_filter.tables import render_table
 
-from .study import drawn_pairs, match_pair, run_study, study_parser
+from .match_lists import KINDS, open_detector_scenes
+from .study import match_pair, run_study, study_parser
 
 STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
 AS_IT_IS = "the fit as it is"
@@ -166,17 +168,20 @@ def origin_table(models: Sequence[TwoViewModel | None], errors_deg: Sequence[flo
 def run(options: argparse.Namespace) -> int:
     """Print both tables."""
     filters = filters_as_asked(options.model)
-    selections = drawn_pairs(options)
-    errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in VARIANTS}
-    ms: dict[str, list[float]] = {name: [] for name in VARIANTS}
+    variants = {name: VARIANTS[name] for name in (AS_IT_IS, *options.variants)}
+    drawn = open_detector_scenes(options.bundles, options.detectors, None, options.per_scene, options.seed)
+    lists = [(scene, kind, scene.lists(KINDS[kind])) for scene in drawn for kind in options.kinds]
+    errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in variants}
+    ms: dict[str, list[float]] = {name: [] for name in variants}
     models: list[TwoViewModel | None] = []
     first_errors: list[float] = []
-    for selection in tqdm(selections, disable=None, unit=" scenes"):
-        for index in selection.indices:
+    for scene, kind, selection in tqdm(lists, disable=None, unit=" lists of a scene"):
+        for index in () if selection is None else selection.indices:
             scored = ScoredPair.of(selection.source[index], filters)
-            for name, variant in VARIANTS.items():
-                per_seed = errors[name].setdefault(selection.source.scene, [[] for _ in options.seeds])
-                for row, seed in zip(per_seed, options.seeds):
+            key = f"{scene.scene}, {scene.detector}, {kind}"
+            for name, variant in variants.items():
+                of_scene = errors[name].setdefault(key, [[] for _ in options.seeds])
+                for row, seed in zip(of_scene, options.seeds):
                     started = time.process_time()
                     model = scored.fit(replace(variant, options=replace(variant.options, seed=seed)))
                     ms[name].append(1e3 * (time.process_time() - started))
@@ -193,7 +198,10 @@ def run(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = done, 2 = a file or option that cannot be used."""
     parser = study_parser("fit_ablation", __doc__)
-    parser.add_argument("bundles", metavar="BUNDLES", help="scene bundles, a file or a folder")
+    parser.add_argument("bundles", metavar="BUNDLES", nargs="+", help="scene bundles, files or folders")
+    parser.add_argument("--detectors", nargs="+", metavar="NAME", help="these alone, as the bundles' names have them")
+    parser.add_argument("--kinds", nargs="+", choices=list(KINDS), default=["raw", "learned"], help="of lists")
+    parser.add_argument("--variants", nargs="+", choices=list(VARIANTS), default=list(VARIANTS), help="rows (all)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], metavar="SEED", help="of the fit (default 0)")
     return run_study(run, parser.parse_args(arguments))
 

@@ -79,5 +79,10 @@ def test_command(tmp_path: Path, model_file: Path, capsys: pytest.CaptureFixture
     study, origins = capsys.readouterr().out.split("\n\n")
     assert study.count("\n| ") == len(VARIANTS)
     assert "100 %" in origins
+    chosen = ["--kinds", "raw", "cross-ratio", "--variants", "PROSAC alone", "--detectors", "SIFT-2000"]
+    assert main([str(tmp_path), "--model", str(model_file), *chosen]) == 0
+    study, origins = capsys.readouterr().out.split("\n\n")
+    assert [row.split(" | ")[0] for row in study.splitlines()[2:]] == [f"| {AS_IT_IS}", "| PROSAC alone"]
+    assert "100 %" in origins
     assert main([str(tmp_path / "missing.npz")]) == 2
     assert "missing.npz" in capsys.readouterr().err
