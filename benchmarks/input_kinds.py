@@ -4,7 +4,8 @@ Every detector whose bundles the folders hold (``scene.detector.npz``; ``scene.n
 that users make of its raw matches, and the filter at its defaults against every robust estimator on exactly the same
 list. An answer is *harmful* that is more than 30 degrees off and called usable while a baseline on the same list is
 below 5. Further tables: means over the lists, bins by the share of right matches and by motion, and what the confidence
-is worth. ``--gaps 1 2 5`` keeps images of sequences that are so many frames apart, and bins by that too.
+is worth, also without the pairs whose label is in doubt (``benchmarks.doubted_labels``). ``--gaps 1 2 5`` keeps images
+of sequences that are so many frames apart, and bins by that too.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -48,6 +49,7 @@ from mgca_filter.evaluation.summarize import scene_errors
 from mgca_filter.result import Status
 from mgca_filter.tables import MISSING, render_table
 
+from .doubted_labels import PairName, doubted_labels
 from .match_lists import KINDS, DetectorScene, ListKind, frame_gap, open_detector_scenes
 from .motion import MOTIONS, Motion
 from .study import run_study, study_parser
@@ -71,6 +73,7 @@ TOLERATED, TOLERATED_LOW = -1.0, -2.0
 """Difference to the best baseline, points, and lower end of its interval below which a row is pointed out."""
 
 SHARES = Grouping("share of right matches in the list", "inlier_share", (0.02, 0.05, 0.1, 0.2, 0.5), 100.0, " %")
+UNDOUBTED = "all whose label is not in doubt"
 MOTION_TITLE, GAP_TITLE = "motion of the camera (a pair may belong to several kinds)", "frames between the images"
 
 NOTES = (
@@ -98,6 +101,7 @@ class Cell:
         outcomes: by method, the filter first.
         motions, gaps: of the pairs of all scenes one after the other; None where a pair cannot be read, and where the
             images' names tell no distance in frames.
+        doubted: likewise, whether unlike detectors contradict the label (:mod:`benchmarks.doubted_labels`).
     """
 
     detector: str
@@ -105,6 +109,7 @@ class Cell:
     outcomes: Mapping[str, SceneOutcomes]
     motions: Sequence[Motion | None]
     gaps: Sequence[int | None]
+    doubted: Sequence[bool]
 
     @cached_property
     def errors(self) -> dict[str, dict[str, FloatArray]]:
@@ -277,10 +282,11 @@ class ConfidenceQuality:
     bins: list[ReliabilityBin]
 
     @classmethod
-    def of(cls, cells: Sequence[Cell]) -> ConfidenceQuality:
-        """Over all answers of some cells."""
-        answers = [one for cell in cells for run in cell.answers for one in run]
-        usable = np.concatenate([cell.usable.ravel() for cell in cells])
+    def of(cls, cells: Sequence[Cell], *, doubted: bool = True) -> ConfidenceQuality:
+        """Over all answers of some cells; or over those alone whose label is not in doubt."""
+        rows = [(cell, np.flatnonzero(~np.array(cell.doubted) | doubted)) for cell in cells]
+        answers = [run[row] for cell, kept in rows for run in cell.answers for row in kept]
+        usable = np.concatenate([cell.usable[:, kept].ravel() for cell, kept in rows])
         right = np.array([one.error_deg < RIGHT_DEG for one in answers])
         known = np.array([one.confidence is not None for one in answers])
         confidence = np.array([one.confidence for one in answers if one.confidence is not None], dtype=np.float64)
@@ -310,7 +316,8 @@ def run_cells(
     scenes: Sequence[DetectorScene], kinds: Sequence[ListKind], model: str | None, store: ResultStore, **options: Any
 ) -> list[Cell]:
     """All methods on all kinds of lists of each detector; ``options`` as :func:`predict.predict` takes them."""
-    motions = {scene: list(_motions(scene)) for scene in scenes}
+    doubted = doubted_labels(scenes)
+    facts = {scene: list(_facts(scene, doubted)) for scene in scenes}
     cells = []
     planned = [(d, kind) for d in dict.fromkeys(scene.detector for scene in scenes) for kind in kinds]
     for detector, kind in tqdm(planned, disable=None, unit=" kinds of lists"):
@@ -320,20 +327,23 @@ def run_cells(
             continue
         methods = methods_of(kind, model)
         results = predict(list(methods.values()), selections, store=store, **options)
-        known = [one for scene, selection in listed if selection is not None for one in motions[scene]]
+        known = [one for scene, selection in listed if selection is not None for one in facts[scene]]
         outcomes = {name: results[method.name] for name, method in methods.items()}
-        cells.append(Cell(detector, kind, outcomes, [one for one, _ in known], [gap for _, gap in known]))
+        motions, gaps, in_doubt = zip(*known)
+        cells.append(Cell(detector, kind, outcomes, motions, gaps, in_doubt))
     return cells
 
 
-def _motions(scene: DetectorScene) -> Iterator[tuple[Motion | None, int | None]]:
+def _facts(scene: DetectorScene, doubted: Container[PairName]) -> Iterator[tuple[Motion | None, int | None, bool]]:
+    """Motion, gap, and whether its label is in doubt, of each pair."""
     for index in scene.indices:
         try:
             pair = scene.source[index]
         except DatasetError:
-            yield None, None
+            yield None, None, False
             continue
-        yield Motion.of(pair), frame_gap(pair.image1, pair.image2)
+        name = (scene.scene, pair.image1, pair.image2)
+        yield Motion.of(pair), frame_gap(pair.image1, pair.image2), name in doubted
 
 
 def grouped(cells: Sequence[Cell], title: str, names: Sequence[str]) -> dict[str, Comparison]:
@@ -402,11 +412,14 @@ class Study:
         names = {SHARES.title: SHARES.names, MOTION_TITLE: MOTIONS, GAP_TITLE: [str(gap) for gap in gaps]}
         detectors = dict.fromkeys(cell.detector for cell in cells)
         confidence = {d: ConfidenceQuality.of([cell for cell in cells if cell.detector == d]) for d in detectors}
+        confidence["all"] = ConfidenceQuality.of(cells)
+        if any(any(cell.doubted) for cell in cells):
+            confidence[UNDOUBTED] = ConfidenceQuality.of(cells, doubted=False)
         return cls(
             cells={(cell.detector, cell.kind.name): one for cell, one in compared},
             means=means,
             groups={title: grouped(cells, title, groups) for title, groups in names.items()},
-            confidence={**confidence, "all": ConfidenceQuality.of(cells)},
+            confidence=confidence,
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -40,6 +40,7 @@ def made_up(
     confidence: Sequence[float | None] = (0.9,) * 4,
     share: Sequence[float] = (0.3,) * 4,
     kind: str = "cross",
+    doubted: Sequence[bool] = (False,) * 4,
 ) -> Cell:
     """One scene of four pairs: errors of the filter's runs, and of the baselines; those not named never find a pose."""
     runs = [
@@ -50,7 +51,7 @@ def made_up(
     for name in ESTIMATORS:
         errors = baselines.get(name, [180.0] * 4)
         outcomes[name] = {"hall": [[outcome(i, error) for i, error in enumerate(errors)]]}
-    return Cell("orb2k", KINDS[kind], outcomes, [None] * 4, [1, 1, 2, None])
+    return Cell("orb2k", KINDS[kind], outcomes, [None] * 4, [1, 1, 2, None], doubted)
 
 
 def compared(cell: Cell) -> Comparison:
@@ -150,6 +151,19 @@ def test_confidence_is_judged_where_there_is_a_pose() -> None:
     never = ConfidenceQuality.of([made_up([[180.0] * 4], {}, ("unrelated",) * 4, (None,) * 4)])
     assert never.to_json()["auroc"] is None
     assert never.to_json()["right_where_usable"] is None
+
+
+def test_confidence_is_also_judged_without_labels_in_doubt() -> None:
+    first = [False, False, True, False]
+    cell = made_up([[1.0, 9.0, 40.0, 180.0]], {}, ("ok",) * 4, (0.9, 0.65, 0.95, 0.3), doubted=first)
+    quality = ConfidenceQuality.of([cell], doubted=False)
+    assert (quality.answers, quality.known, quality.usable) == (3, 3, 2)
+    assert quality.auroc == 1.0
+    assert quality.right_where_usable == 1.0
+    confidence = Study.of([cell]).confidence
+    assert list(confidence) == ["orb2k", "all", input_kinds.UNDOUBTED]
+    assert confidence["all"].answers == 4
+    assert input_kinds.UNDOUBTED not in Study.of([made_up([RIGHT_EVERYWHERE], {})]).confidence
 
 
 def test_the_study_of_several_cells_adds_up() -> None:
