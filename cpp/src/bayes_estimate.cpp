@@ -24,7 +24,6 @@ constexpr double kSpread = 1.5, kWidest = 0.3;
 // Matches this close to a centre, pixels, tell how firmly it is held, times the scale of the noise; those within the
 // reach of any centre tell the poses drawn from each other.
 constexpr double kHoldingPx = 2.0, kReachPx = 6.0;
-constexpr std::size_t kMinHolding = 6;
 // Where focal lengths are huge, what a direction adds to the information may be less than the rounding of the others.
 constexpr double kRounding = 1e-12;
 // Matches are not independent: their log-likelihood counts half.
@@ -232,7 +231,7 @@ std::optional<Pose> expected_best(const Correspondences& matches, const std::vec
                 holding.push_back(i);
             }
         }
-        if (holding.size() >= kMinHolding) {
+        if (holding.size() >= static_cast<std::size_t>(kMinRefinedInliers)) {
             posterior.draw(hypotheses[one], holding, draws);
         }
     }

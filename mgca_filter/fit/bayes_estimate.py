@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.epipolar import homogeneous_columns
-from ..geometry.pose_refinement import SampsonTerms, apply_steps
+from ..geometry.pose_refinement import MIN_INLIERS, SampsonTerms, apply_steps
 from . import choice
 from .choice import Coefficients, Residuals
 from .evidence import FIRM_MATCHES
@@ -29,7 +29,6 @@ _DRAWN, _SPREAD, _WIDEST = 96, 1.5, 0.3
 # Matches this close to a centre, pixels, tell how firmly it is held, times the scale of the noise; those within the
 # reach of any centre tell the poses drawn from each other.
 _HOLDING_PX, _REACH_PX = 2.0, 6.0
-_MIN_HOLDING = 6
 # Where focal lengths are huge, what a direction adds to the information may be less than the rounding of the others.
 _ROUNDING = 1e-12
 # Matches are not independent: their log-likelihood counts half.
@@ -40,8 +39,7 @@ _HALF_WORTH_DEG = 16.0
 _LEAST_WEIGHT = 1e-3
 # An answer explains this share of the matches that the best hypothesis does, and no fewer than a pose takes.
 _EXPLAINED_SHARE = 0.6
-
-
+# Dimensions that meet in the transform of Box and Muller: those that give the least covariance.
 _RADII, _TURNS = [3, 1, 5], [0, 4, 2]
 
 
@@ -49,7 +47,7 @@ def _quasi_normals(count: int) -> Array:
     """Points (count + 1, 5) that fill a standard normal distribution evenly, the first of them 0.
 
     An additive recurrence in six dimensions (M. Roberts, The unreasonable effectiveness of quasirandom sequences, 2018)
-    and the transform of Box and Muller, in which those dimensions meet that give the least covariance.
+    and the transform of Box and Muller.
     """
     ratio = 1.0
     for _ in range(64):  # of x ** 7 = x + 1
@@ -85,7 +83,7 @@ def expected_best(
     draws = []
     for one in centres:
         holding = (residuals.distance_px[one] < _HOLDING_PX * scale) & ~residuals.behind[one]
-        if np.count_nonzero(holding) >= _MIN_HOLDING:
+        if np.count_nonzero(holding) >= MIN_INLIERS:
             draws.append(posterior.draw(holding, R[one], t[one]))
     if not draws:
         return None
