@@ -99,15 +99,6 @@ Vec5d solve_transposed(const Matx55d& root, const Vec5d& b) {
     return x;
 }
 
-/// How many matches a pose explains.
-std::size_t explained(const Residuals& residuals) {
-    std::size_t count = 0;
-    for (std::size_t i = 0; i < residuals.distance_px.size(); ++i) {
-        count += residuals.distance_px[i] < kInlierPx && residuals.behind[i] == 0 ? 1 : 0;
-    }
-    return count;
-}
-
 /// What the matches of a pair say of a pose.
 class Posterior {
 public:
@@ -227,7 +218,7 @@ std::optional<Pose> expected_best(const Correspondences& matches, const std::vec
     for (const std::size_t one : centres) {
         std::vector<std::size_t> holding;
         for (const std::size_t i : all) {
-            if (residuals[one].distance_px[i] < kHoldingPx * scale && residuals[one].behind[i] == 0) {
+            if (residuals[one].explains(i, kHoldingPx * scale)) {
                 holding.push_back(i);
             }
         }
@@ -253,12 +244,12 @@ std::optional<Pose> expected_best(const Correspondences& matches, const std::vec
             heavy.push_back(s);
         }
     }
-    const double least = std::max(kExplainedShare * static_cast<double>(explained(residuals[centres[0]])),
+    const double least = std::max(kExplainedShare * static_cast<double>(residuals[centres[0]].explained()),
                                   static_cast<double>(kFirmMatches));
     std::optional<Pose> best;
     double most = -std::numeric_limits<double>::infinity();
     for (const std::size_t candidate : heavy) {
-        if (static_cast<double>(explained(near[candidate])) < least) {
+        if (static_cast<double>(near[candidate].explained()) < least) {
             continue;
         }
         double worth = 0.0;

@@ -139,6 +139,14 @@ Coefficients Coefficients::read(const Json& values) {
     return c;
 }
 
+std::size_t Residuals::explained(double reach_px) const {
+    std::size_t count = 0;
+    for (std::size_t i = 0; i < distance_px.size(); ++i) {
+        count += explains(i, reach_px) ? 1 : 0;
+    }
+    return count;
+}
+
 Residuals measure_residuals(const Correspondences& matches, const Pose& pose, double focal_px) {
     Residuals residuals;
     residuals.distance_px.reserve(matches.size());
@@ -252,12 +260,8 @@ Judgement judge_hypotheses(const Correspondences& matches, const std::optional<s
     std::vector<std::size_t> inliers;
     for (const Hypothesis& hypothesis : hypotheses) {
         const Residuals& residual = residuals.emplace_back(measure_residuals(matches, hypothesis.pose, focal_px));
-        std::size_t near = 0;
-        for (std::size_t i = 0; i < count; ++i) {
-            near += residual.distance_px[i] < kInlierPx && residual.behind[i] == 0 ? 1 : 0;
-        }
-        inliers.push_back(near);
-        most_inliers = std::max(most_inliers, near);
+        inliers.push_back(residual.explained());
+        most_inliers = std::max(most_inliers, inliers.back());
     }
     const double share =
         std::clamp(static_cast<double>(most_inliers) / static_cast<double>(std::max<std::size_t>(count, 1)), kMinShare,

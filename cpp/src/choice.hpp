@@ -68,6 +68,13 @@ struct Hypothesis {
 struct Residuals {
     std::vector<double> distance_px;  // Sampson distances
     Mask behind;  // 1 where a match lies behind a camera and its rays are not nearly parallel
+
+    /// Whether a match lies within a distance, pixels, of what the hypothesis wants, and in front of it.
+    bool explains(std::size_t match, double reach_px = kInlierPx) const {
+        return distance_px[match] < reach_px && behind[match] == 0;
+    }
+    /// How many do.
+    std::size_t explained(double reach_px = kInlierPx) const;
 };
 
 /// The chosen hypothesis.

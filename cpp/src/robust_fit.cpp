@@ -16,8 +16,9 @@ namespace {
 constexpr double kSameDeg = 0.3, kTwinDeg = 2.0;
 // The early end is given up where a run explains less than the first share of the list; above the second, one will do.
 constexpr double kPromising = 0.3, kCertain = 0.7;
-// A twin that explains less than this share of what the best pose does, before it is refined, is no alternative.
-constexpr double kTwinShare = 0.5;
+// A twin that explains less than this share of what the best pose does within so many pixels, before it is refined, is
+// no alternative.
+constexpr double kTwinShare = 0.5, kTwinPx = 2.0;
 // Of fewer matches than this the best explanation is best by luck. From this angle on the pose that is expected nearest to
 // the truth is another answer; else the refined one is finer.
 constexpr std::size_t kFewMatches = 200;
@@ -234,12 +235,7 @@ void Search::add(Found found) {
 }
 
 int Search::near(const Pose& pose) const {
-    const Residuals residuals = measure_residuals(fitted_, pose, evidence_.focal_px);
-    int count = 0;
-    for (std::size_t i = 0; i < fitted_.size(); ++i) {
-        count += residuals.distance_px[i] < 2.0 && residuals.behind[i] == 0 ? 1 : 0;
-    }
-    return count;
+    return static_cast<int>(measure_residuals(fitted_, pose, evidence_.focal_px).explained(kTwinPx));
 }
 
 double Search::explained() { return poses_.empty() ? 0.0 : std::exp(judge()[Feature::log_share]); }
@@ -303,7 +299,7 @@ std::optional<TwoViewModel> Search::refined(std::optional<TwoViewModel> model) c
     std::vector<double> moved, distances, moved_inliers;
     for (std::size_t i = 0; i < judged_.size(); ++i) {
         moved.push_back(parallax(judged_[i], model->pose.R));
-        if (residuals.distance_px[i] < kInlierPx && residuals.behind[i] == 0) {
+        if (residuals.explains(i)) {
             distances.push_back(residuals.distance_px[i]);
             moved_inliers.push_back(moved[i]);
         }

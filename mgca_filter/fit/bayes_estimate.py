@@ -80,11 +80,10 @@ def expected_best(
     posterior = _Posterior(correspondences, scores, scale, focal_px, coefficients)
     residuals = choice.measure_residuals(correspondences, R, t, focal_px)
     centres = _distinct(R, t, posterior.log_density(residuals))
-    draws = []
+    draws, held = [], residuals.explained(_HOLDING_PX * scale)
     for one in centres:
-        holding = (residuals.distance_px[one] < _HOLDING_PX * scale) & ~residuals.behind[one]
-        if np.count_nonzero(holding) >= MIN_INLIERS:
-            draws.append(posterior.draw(holding, R[one], t[one]))
+        if np.count_nonzero(held[one]) >= MIN_INLIERS:
+            draws.append(posterior.draw(held[one], R[one], t[one]))
     if not draws:
         return None
     drawn_R, drawn_t, log_proposal = (np.concatenate(part) for part in zip(*draws))
@@ -95,8 +94,8 @@ def expected_best(
     weight = np.exp(np.minimum(log_weight - np.sort(log_weight)[-2], 0.0))
     heavy = weight > _LEAST_WEIGHT
     drawn_R, drawn_t, weight = drawn_R[heavy], drawn_t[heavy], weight[heavy]
-    least = max(_EXPLAINED_SHARE * int(_explained(residuals)[centres[0]]), FIRM_MATCHES)
-    candidates = np.flatnonzero(_explained(near)[heavy] >= least)
+    least = max(_EXPLAINED_SHARE * np.count_nonzero(residuals.explained()[centres[0]]), FIRM_MATCHES)
+    candidates = np.flatnonzero(near.explained()[heavy].sum(axis=1) >= least)
     if len(candidates) == 0:
         return None
     angles = choice.pairwise_angles_deg(drawn_R[candidates], drawn_t[candidates], drawn_R, drawn_t)
@@ -134,11 +133,6 @@ class _Posterior:
         steps = _SPREAD * np.asarray(np.linalg.solve(root.T, _NORMALS.T).T, dtype=np.float64)
         log_proposal = np.log(np.diag(root)).sum() - 0.5 * np.einsum("sk,sk->s", _NORMALS, _NORMALS)
         return *apply_steps(R, t, steps), log_proposal
-
-
-def _explained(residuals: Residuals) -> NDArray[np.intp]:
-    """How many matches each pose (H,) explains."""
-    return np.asarray(((residuals.distance_px < choice.INLIER_PX) & ~residuals.behind).sum(axis=1))
 
 
 def _distinct(R: Array, t: Array, log_density: Array) -> list[int]:

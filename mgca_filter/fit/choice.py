@@ -143,6 +143,10 @@ class Residuals:
     distance_px: Array
     behind: BoolArray
 
+    def explained(self, reach_px: float = INLIER_PX) -> BoolArray:
+        """Which matches (H, N) lie within a distance, pixels, of what a hypothesis wants, and in front of it."""
+        return np.asarray((self.distance_px < reach_px) & ~self.behind)
+
 
 @dataclass(frozen=True)
 class Judgement:
@@ -286,7 +290,7 @@ def judge(
     residuals = measure_residuals(correspondences, hypotheses.R, hypotheses.t, focal_px)
     distance, front = residuals.distance_px, ~residuals.behind
     count = len(correspondences)
-    near = (distance < INLIER_PX) & front  # (H, N)
+    near = residuals.explained()
     inliers = near.sum(axis=1)
     share = float(np.clip(inliers.max() / max(count, 1), MIN_SHARE, MAX_SHARE))
     weights = np.full(count, share) if scores is None else scores

@@ -283,8 +283,7 @@ class Search:
         """Numbers of matches (N, 4) within a distance of each pose and in front of it."""
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
         residuals = choice.measure_residuals(matches, R, t, self._evidence.focal_px)
-        near = (residuals.distance_px < reach_px) & ~residuals.behind
-        return [int(count) for count in near.sum(axis=1)]
+        return [int(count) for count in residuals.explained(reach_px).sum(axis=1)]
 
     def _best(self) -> _Pose:
         """The best of what was found so far."""
