@@ -32,7 +32,7 @@ from mgca_filter.geometry.epipolar import decompose_essential, pose_error_deg
 from mgca_filter.inputs.attributes import MatchAttributes
 from mgca_filter.inputs.options import FilterOptions
 from mgca_filter.inputs.pair import MatchPair
-from mgca_filter.match_filter import MatchFilter, model_path
+from mgca_filter.match_filter import MatchFilter, find_models
 from mgca_filter.result import Status
 from mgca_filter.tables import render_table
 
@@ -162,10 +162,11 @@ def _plausible_camera(size: Any) -> NDArray[np.float64]:
 
 
 class JudgedStore:
-    """Answers on disk, one file per model, options and source code; an interrupted run goes on where it stopped."""
+    """Answers on disk, one file per models, options and source code; an interrupted run goes on where it stopped."""
 
-    def __init__(self, folder: Path, model: Path, method: str) -> None:
-        parts = [method, runtime_source_digest(), cv2.__version__, hashlib.sha256(model.read_bytes()).hexdigest()]
+    def __init__(self, folder: Path, models: Sequence[Path], method: str) -> None:
+        parts = [method, runtime_source_digest(), cv2.__version__]
+        parts += [hashlib.sha256(model.read_bytes()).hexdigest() for model in models]
         self._path = folder / f"verdicts.{hashlib.sha256('|'.join(parts).encode()).hexdigest()[:16]}.jsonl"
         lines = self._path.read_text().splitlines() if self._path.exists() else []
         self._known = {(row.name, row.intrinsics): row for row in (Judged(**json.loads(line)) for line in lines)}
@@ -234,9 +235,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Draw the pairs, judge them, print the table."""
-    model = Path(options.model or model_path())
-    match_filter = MatchFilter(model=model, method=options.method)
-    store = JudgedStore(options.store, model, options.method)
+    match_filter = MatchFilter(model=options.model, method=options.method)
+    store = JudgedStore(options.store, find_models(options.model), options.method)
     photos = PhotoFolder(options.photos, options.store)
     places = read_places(options.same_place) if options.same_place else []
     names = draw_unrelated(photos.names, places, options.pairs, options.seed)

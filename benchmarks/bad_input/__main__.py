@@ -25,7 +25,7 @@ import numpy as np
 
 from mgca_filter import cli
 from mgca_filter.inputs.options import FilterOptions
-from mgca_filter.match_filter import MatchFilter, model_path
+from mgca_filter.match_filter import MatchFilter
 from mgca_filter.opencv.twins import findEssentialMat, findFundamentalMat, matchMGCA
 from mgca_filter.tables import render_table
 
@@ -104,7 +104,7 @@ def _pixels(keypoints: Any) -> Any:
     return np.asarray(keypoints, dtype=np.float64).reshape(-1, 2)
 
 
-def try_files(model: Path) -> Iterator[Trial]:
+def try_files(model: str) -> Iterator[Trial]:
     """``mgca-match`` on every kind of file: an exit status and at most one line on stderr, never a traceback."""
     with tempfile.TemporaryDirectory() as folder:
         good = Path(folder) / "good.png"
@@ -117,7 +117,7 @@ def try_files(model: Path) -> Iterator[Trial]:
             def call(path: Path = path, statuses: Sequence[int] = statuses) -> list[str]:
                 out = io.StringIO()
                 with contextlib.redirect_stderr(out), contextlib.redirect_stdout(io.StringIO()):
-                    status = cli.main([str(good), str(path), "--model", str(model), "--max-keypoints", "200"])
+                    status = cli.main([str(good), str(path), "--model", model, "--max-keypoints", "200"])
                 words = out.getvalue()
                 unnamed = status == 2 and ("bad.png" not in words or words.count("\n") != 1)
                 wrong = [] if status in statuses else [f"exit status {status}"]
@@ -126,7 +126,7 @@ def try_files(model: Path) -> Iterator[Trial]:
             yield Trial(f"file: {kind}", "mgca-match", _failure(call, kind))
 
 
-def try_databases(model: Path) -> Iterator[Trial]:
+def try_databases(model: str) -> Iterator[Trial]:
     """``mgca-match colmap`` on every kind of database: an exit status that is right, never a traceback."""
     try:
         import pycolmap  # noqa: F401
@@ -140,7 +140,7 @@ def try_databases(model: Path) -> Iterator[Trial]:
 
             def call(path: Path = path, statuses: Sequence[int] = statuses) -> list[str]:
                 out = io.StringIO()
-                words = [str(path), "-o", str(path) + ".out.db", "-q", "--model", str(model)]
+                words = [str(path), "-o", str(path) + ".out.db", "-q", "--model", model]
                 with contextlib.redirect_stderr(out), contextlib.redirect_stdout(io.StringIO()):
                     status = cli.main(["colmap", *words])
                 unnamed = status == 2 and (path.name not in out.getvalue() or out.getvalue().count("\n") != 1)
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; 0 = no failure, 1 = some, listed on stderr, 2 = a model or option that cannot be used."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.bad_input", description=__doc__)
     parser.add_argument("--rounds", type=int, default=len(COUNTS), metavar="N", help="inputs of each kind and entry")
-    parser.add_argument("--model", type=Path, default=model_path(), metavar="FILE")
+    parser.add_argument("--model", default="default", metavar="MODEL", help="file, or name as in filter_matches")
     parser.add_argument("--method", default=FilterOptions.method)
     parser.add_argument("--seed", type=int, default=0)
     return run_study(run, parser.parse_args(arguments))
