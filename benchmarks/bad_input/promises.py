@@ -25,7 +25,8 @@ def broken_promises(result: FilterResult, count: int) -> list[str]:
         broken.append("status is none of the documented")
     if (result.t is None) != (result.E is None) or (result.R is None and result.t is not None):
         broken.append("pose and E do not come together")
-    if result.E is None and result.F is None and result.R is None and result.mask.any():
+    models = (result.E, result.F, result.R, result.H)  # of a plane in a mirror H alone
+    if all(model is None for model in models) and result.mask.any():
         broken.append("matches kept without a model")
     broken += broken_essential(result.E)
     if result.F is not None:
