@@ -162,7 +162,7 @@ def _plausible_camera(size: Any) -> NDArray[np.float64]:
 
 
 class JudgedStore:
-    """Answers on disk, one file per models, options and source code; an interrupted run goes on where it stopped."""
+    """Answers on disk, a file for each set of models, options and code; an interrupted run goes on where it stopped."""
 
     def __init__(self, folder: Path, models: Sequence[Path], method: str) -> None:
         parts = [method, runtime_source_digest(), cv2.__version__]

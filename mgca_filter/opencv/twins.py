@@ -412,7 +412,6 @@ def _read_params(params: cv2.UsacParams) -> FilterOptions:
     return _read_fit(params.confidence, params.threshold, params.maxIterations, seed)
 
 
-@np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
 def _fit_essential(
     points1: Any, points2: Any, K1: Any, K2: Any, dist1: Any, dist2: Any, options: FilterOptions, mask: Any
 ) -> Answer:
@@ -451,7 +450,6 @@ def _essential_of_rotation(R: NDArray[np.float64]) -> NDArray[np.float64]:
     return max(candidates, key=lambda E: float(np.vdot(cv2.decomposeEssentialMat(E)[0], R)))
 
 
-@np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
 def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: Any) -> Answer:
     """F (3, 3), or None where nothing can be found, and the mask (N, 1); arguments as in ``findFundamentalMat``."""
     points1, points2 = _read_points(points1, points2)
@@ -460,7 +458,6 @@ def _fit_fundamental(points1: Any, points2: Any, options: FilterOptions, mask: A
     return _scaled(F), _as_opencv_mask(result.mask, mask)
 
 
-@np.errstate(all="ignore")  # data never raises, whatever the caller's numpy.seterr says
 def _fit_map(family: _Family, points1: Any, points2: Any, options: FilterOptions, lmeds: bool, mask: Any) -> Answer:
     """A map of a family, (3, 3) or (2, 3), or None where nothing can be found, and the mask (N, 1)."""
     points1, points2 = _read_points(points1, points2)
