@@ -2,8 +2,11 @@
 
 The networks score every pair once; then the fit runs as users get it, and with one thing changed at a time. Each row
 has its difference to the fit as it is, on the same pairs and the same draws of the bootstrap. A second table tells
-where the answers came from, and how often each origin is right. ``--kinds`` makes lists of the raw matches first, as
-users do; every scene counts once for each detector and kind. ``--variants`` runs some rows alone.
+where the answers came from, and how often each origin is right. Times are the processor's, on one thread; beside each
+stands what the fit and the networks that it asked take together, as a multiple of USAC_MAGSAC's 5000 iterations at half
+a pixel on the same list, whose own answers are the last row: the rows are a curve of accuracy over time. ``--kinds``
+makes lists of the raw matches first, as users do; every scene counts once for each detector and kind. ``--variants``
+runs some rows alone.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from tqdm import tqdm
@@ -25,7 +28,7 @@ from mgca_filter.evaluation.metrics import (
     mean_over_scenes,
     paired_bootstrap_interval,
 )
-from mgca_filter.export.choice_fit import filters_as_asked, scored_evidence
+from mgca_filter.export.choice_fit import evidence_behind, filters_as_asked
 from mgca_filter.fit.evidence import Evidence, gather_before
 from mgca_filter.fit.robust_fit import PLAN, POSELIB, Plan, Search, TwoViewModel
 from mgca_filter.fit.sources import Proposal
@@ -36,10 +39,12 @@ from mgca_filter.match_filter import MatchFilter
 from mgca_filter.tables import render_table
 
 from .match_lists import KINDS, open_detector_scenes
+from .speed import answer_error_deg, magsac
 from .study import match_pair, run_study, study_parser
 
 STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
 AS_IT_IS = "the fit as it is"
+REPLACED = "USAC_MAGSAC, 5000 iterations"
 RIGHT_DEG = 10.0
 
 
@@ -93,16 +98,24 @@ VARIANTS = {
     "PoseLib among the sources": Variant(replace(PLAN, second=(*PLAN.second, POSELIB))),
     "MAGSAC alone": Variant(options=FilterOptions(method="magsac"), early_end=False),
     "PROSAC alone": Variant(options=FilterOptions(method="prosac"), early_end=False),
+    "the fast network, the first sources, a quarter of the samples": Variant(
+        replace(_drawing(0.25), second=()), looks=(0,)
+    ),
 }
 
 
 @dataclass(frozen=True)
 class ScoredPair:
-    """A pair behind the networks: what the fit sees before them, and after each."""
+    """A pair behind the networks: what the fit sees before them, and after each.
+
+    Attributes:
+        network_ms: what the networks up to each took together.
+    """
 
     pair: ScenePair
     before: Evidence
     after: tuple[Evidence, ...]
+    network_ms: tuple[float, ...]
     coefficients: Mapping[str, Sequence[float]]
 
     @classmethod
@@ -110,17 +123,24 @@ class ScoredPair:
         """Run the networks once; ``filters`` are over the networks as they are asked."""
         asked = match_pair(pair)
         prepared = prepare_pair(asked)
-        after = tuple(scored_evidence(match_filter, asked, prepared) for match_filter in filters)
-        return cls(pair, gather_before(prepared), after, filters[-1].metadata.choice)
+        results = [match_filter.filter_many([asked])[0] for match_filter in filters]
+        after = tuple(evidence_behind(*behind, prepared) for behind in zip(results, filters))
+        network_ms = tuple(result.info["timings_ms"]["network"] for result in results)
+        return cls(pair, gather_before(prepared), after, network_ms, filters[-1].metadata.choice)
 
-    def fit(self, variant: Variant) -> TwoViewModel | None:
-        """The model that a variant finds."""
+    def fit(self, variant: Variant) -> tuple[TwoViewModel | None, float]:
+        """The model that a variant finds, and the milliseconds of the networks that it asked."""
         search = Search(self.before, self.coefficients, variant.options, variant.plan)
-        *looks, last = self.after if variant.looks is None else [self.after[i] for i in variant.looks]
         model = search.before_network() if variant.early_end else None
-        for evidence in looks:
-            model = search.after_first_look(evidence) if model is None else model
-        return search.with_network(last) if model is None else model
+        if model is not None:
+            return model, 0.0
+        looks = list(zip(self.after, self.network_ms))
+        *looks, (last, all_ms) = looks if variant.looks is None else [looks[i] for i in variant.looks]
+        for evidence, ms in looks:
+            model = search.after_first_look(evidence)
+            if model is not None:
+                return model, ms
+        return search.with_network(last), all_ms
 
     def error_deg(self, model: TwoViewModel | None) -> float:
         """Pose error, degrees; 180 without a model."""
@@ -129,13 +149,27 @@ class ScoredPair:
         return pose_error_deg(model.answer.R, model.answer.t, self.pair.R, self.pair.t)
 
 
-def format_study(errors: Mapping[str, Mapping[str, FloatArray]], ms: Mapping[str, float]) -> str:
-    """A row a variant: means over scenes, differences to the fit as it is, milliseconds.
+@dataclass
+class Times:
+    """Milliseconds of one variant, an entry an answer: of the fit, and of the networks that it asked."""
+
+    fit: list[float] = field(default_factory=list)
+    networks: list[float] = field(default_factory=list)
+
+    def cells(self, magsac_ms: float) -> list[str]:
+        """Mean time of the fit, and of all as a multiple of MAGSAC's mean."""
+        fit_ms = float(np.mean(self.fit))
+        return [f"{fit_ms:.1f}", f"{(fit_ms + float(np.mean(self.networks))) / magsac_ms:.2f}"]
+
+
+def format_study(errors: Mapping[str, Mapping[str, FloatArray]], times: Mapping[str, Times]) -> str:
+    """A row a variant: means over scenes, differences to the fit as it is, times.
 
     Args:
         errors: by variant and scene, (S, P) degrees of S seeds and P pairs.
-        ms: by variant, mean time of the fit.
+        times: by variant; those of :data:`REPLACED` are what the others are compared with.
     """
+    magsac_ms = float(np.mean(times[REPLACED].fit))
     body = []
     for name, by_scene in errors.items():
         cells = [f"{100 * mean_over_scenes(POSE_STATISTICS[s], by_scene):.1f}" for s in STATISTICS]
@@ -149,8 +183,8 @@ def format_study(errors: Mapping[str, Mapping[str, FloatArray]], ms: Mapping[str
             interval = paired_bootstrap_interval(by_scene, reference, function)
             low, middle, high = (100 * value for value in (interval[0], difference, interval[1]))
             cells.append(f"{middle:+.1f} [{low:+.1f}, {high:+.1f}]")
-        body.append([name, *cells, f"{ms[name]:.1f}"])
-    header = ["", *STATISTICS, "difference in mAP@20", "in AUC@5", "fit, ms"]
+        body.append([name, *cells, *times[name].cells(magsac_ms)])
+    header = ["", *STATISTICS, "difference in mAP@20", "in AUC@5", "fit, ms", "with networks, of MAGSAC's time"]
     return render_table(header, body)
 
 
@@ -171,8 +205,8 @@ def run(options: argparse.Namespace) -> int:
     variants = {name: VARIANTS[name] for name in (AS_IT_IS, *options.variants)}
     drawn = open_detector_scenes(options.bundles, options.detectors, None, options.per_scene, options.seed)
     lists = [(scene, kind, scene.lists(KINDS[kind])) for scene in drawn for kind in options.kinds]
-    errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in variants}
-    ms: dict[str, list[float]] = {name: [] for name in variants}
+    errors: dict[str, dict[str, list[list[float]]]] = {name: {} for name in (*variants, REPLACED)}
+    times = {name: Times() for name in errors}
     models: list[TwoViewModel | None] = []
     first_errors: list[float] = []
     for scene, kind, selection in tqdm(lists, disable=None, unit=" lists of a scene"):
@@ -183,14 +217,22 @@ def run(options: argparse.Namespace) -> int:
                 of_scene = errors[name].setdefault(key, [[] for _ in options.seeds])
                 for row, seed in zip(of_scene, options.seeds):
                     started = time.process_time()
-                    model = scored.fit(replace(variant, options=replace(variant.options, seed=seed)))
-                    ms[name].append(1e3 * (time.process_time() - started))
+                    model, network_ms = scored.fit(replace(variant, options=replace(variant.options, seed=seed)))
+                    times[name].fit.append(1e3 * (time.process_time() - started))
+                    times[name].networks.append(network_ms)
                     row.append(scored.error_deg(model))
                     if name == AS_IT_IS:
                         models.append(model)
                         first_errors.append(row[-1])
+            started = time.process_time()
+            answer = magsac(scored.pair, 5000, 0.5, 0.9999)
+            times[REPLACED].fit.append(1e3 * (time.process_time() - started))
+            times[REPLACED].networks.append(0.0)
+            error = answer_error_deg(scored.pair, answer)
+            for row in errors[REPLACED].setdefault(key, [[] for _ in options.seeds]):
+                row.append(FAILURE_DEG if error is None else error)
     arrays = {name: {scene: np.array(rows) for scene, rows in by_scene.items()} for name, by_scene in errors.items()}
-    print(format_study(arrays, {name: float(np.mean(times)) for name, times in ms.items()}))
+    print(format_study(arrays, times))
     print("\n" + origin_table(models, first_errors))
     return 0
 

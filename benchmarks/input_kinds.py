@@ -52,7 +52,7 @@ from mgca_filter.tables import MISSING, render_table
 from .doubted_labels import PairName, doubted_labels
 from .match_lists import KINDS, DetectorScene, ListKind, frame_gap, open_detector_scenes
 from .motion import MOTIONS, Motion
-from .study import run_study, study_parser
+from .study import CONFIDENCE_LIMITS, run_study, study_parser
 
 OURS = "filter"
 # PoseLib's own limit of 100 000 iterations takes seconds on a hopeless list.
@@ -270,6 +270,8 @@ class ConfidenceQuality:
         usable: answers with a pose that is called usable. right_where_usable: share of them.
         kept_of_right: share of the right poses that are called usable.
         bins: reliability of the confidence.
+        curve: for each of CONFIDENCE_LIMITS, the share of right ones among the poses at least so sure, and the share of
+            the right poses that are.
     """
 
     answers: int
@@ -280,6 +282,7 @@ class ConfidenceQuality:
     right_where_usable: float
     kept_of_right: float
     bins: list[ReliabilityBin]
+    curve: list[tuple[float, float]]
 
     @classmethod
     def of(cls, cells: Sequence[Cell], *, doubted: bool = True) -> ConfidenceQuality:
@@ -300,12 +303,21 @@ class ConfidenceQuality:
             right_where_usable=_share(right[usable]),
             kept_of_right=_share(usable[right]),
             bins=bins,
+            curve=[
+                (_share(right[known][confidence >= limit]), _share((confidence >= limit)[right[known]]))
+                for limit in CONFIDENCE_LIMITS
+            ],
         )
 
     def to_json(self) -> dict[str, Any]:
         """JSON values; what is not defined is None."""
-        values = {**vars(self), "bins": [vars(one) for one in self.bins]}
-        return {name: None if isinstance(v, float) and np.isnan(v) else v for name, v in values.items()}
+        curve = [[_defined(share) for share in shares] for shares in self.curve]
+        values = {**vars(self), "bins": [vars(one) for one in self.bins], "curve": curve}
+        return {name: _defined(value) for name, value in values.items()}
+
+
+def _defined(value: Any) -> Any:
+    return None if isinstance(value, float) and np.isnan(value) else value
 
 
 def _share(flags: BoolArray) -> float:
@@ -450,7 +462,8 @@ def format_study(study: Study, *, gaps: bool) -> str:
         if title != GAP_TITLE or gaps:
             rows = [[name, *comparison_cells(one)] for name, one in groups.items()]
             parts.append(render_table(["group", *COMPARISON_HEADER], rows, align=align[1:], title=f"By {title}"))
-    return "\n\n".join([*parts, _confidence_table(study.confidence), _reliability_table(study.confidence)])
+    tables = (_confidence_table, _curve_table, _reliability_table)
+    return "\n\n".join([*parts, *(table(study.confidence) for table in tables)])
 
 
 def _lost_sentence(study: Study) -> str:
@@ -501,6 +514,16 @@ def _confidence_table(confidence: Mapping[str, ConfidenceQuality]) -> str:
         "usable where right",
     ]
     return render_table(header, rows, title="Confidence (right = within 10°)")
+
+
+def _curve_table(confidence: Mapping[str, ConfidenceQuality]) -> str:
+    rows = [
+        [name, *(f"{_number(right, 100.0, 1)} · {_number(kept, 100.0, 1)}" for right, kept in quality.curve)]
+        for name, quality in confidence.items()
+    ]
+    header = ["detector", *(f"from {limit}" for limit in CONFIDENCE_LIMITS)]
+    title = "Right where the confidence is at least so much, % · of the right poses, those that are kept, %"
+    return render_table(header, rows, title=title)
 
 
 def _reliability_table(confidence: Mapping[str, ConfidenceQuality]) -> str:

@@ -32,7 +32,7 @@ from mgca_filter.result import FilterResult, Status
 from mgca_filter.tables import markdown_head, markdown_row
 
 from .photographs import Camera, PhotoPair, Setting, add_settings, read_scene
-from .study import run_study, study_parser
+from .study import CONFIDENCE_LIMITS, run_study, study_parser
 
 Array = NDArray[np.float64]
 
@@ -257,18 +257,18 @@ HEADER = [
     "lists",
     *(f"{status.value}, %" for status in SHOWN),
     "planar with E, %",
-    "confidence: median, 90 %, 99 %",
+    f"confidence from {' · '.join(map(str, CONFIDENCE_LIMITS))}, %",
 ]
 ALIGN = "ll" + "r" * (len(HEADER) - 2)
 
 
 def row(kind: str, matches: str, results: Sequence[FilterResult]) -> list[str]:
-    """Cells of a line: how often which status was given, and how sure the filter was of its poses (0 without one)."""
+    """Cells of a line: how often which status was given, and how often the filter was so sure of a pose."""
     counts = Counter(result.status for result in results)
     shares = [f"{100.0 * counts[status] / len(results):.1f}" for status in SHOWN]
     planar = sum(result.status is Status.PLANAR and result.E is not None for result in results)
-    confidence = np.percentile([result.confidence or 0.0 for result in results], [50, 90, 99])
-    sure = " · ".join(f"{value:.2f}" for value in confidence)
+    confidence = np.array([result.confidence or 0.0 for result in results])
+    sure = " · ".join(f"{100.0 * np.mean(confidence >= limit):.1f}" for limit in CONFIDENCE_LIMITS)
     return [kind, matches, str(len(results)), *shares, f"{100.0 * planar / len(results):.1f}", sure]
 
 

@@ -134,7 +134,7 @@ def magsac(
     return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, confidence, threshold, iterations)
 
 
-def answer_error_deg(pair: RawPair, answer: Any) -> float | None:
+def answer_error_deg(pair: RawPair | ScenePair, answer: Any) -> float | None:
     """Pose error of what a whole call returned, 180 without a pose; None where it returns no geometry at all."""
     if isinstance(answer, FilterResult):
         pose = None if answer.R is None or answer.t is None else (answer.R, answer.t)

@@ -16,6 +16,9 @@ from mgca_filter.geometry.epipolar import pose_error_deg
 from mgca_filter.inputs.pair import MatchPair
 from mgca_filter.result import FilterResult
 
+CONFIDENCE_LIMITS = (0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
+"""Where a caller might draw the line; two studies tell what each of these costs and what it keeps out."""
+
 
 def study_parser(name: str, description: str | None, *, per_scene: bool = True) -> argparse.ArgumentParser:
     """Parser of ``python -m benchmarks.NAME`` with ``--seed``, ``--model`` and, where it is wanted, ``--per-scene``."""

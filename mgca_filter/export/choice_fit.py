@@ -36,6 +36,7 @@ from ..geometry.epipolar import pose_error_deg
 from ..inference.model_file import SUMS_NAME, record_checksums
 from ..inputs.pair import MatchPair, PairInput, prepare_pair
 from ..match_filter import MatchFilter, find_models
+from ..result import FilterResult
 from .calibration_fit import expected_calibration_error
 from .pairs_apart import CROSS_RATIO, lists_of, parts_of_photographs, plausible_camera, rendered_apart
 
@@ -158,7 +159,11 @@ def filters_as_asked(model: Path | None) -> list[MatchFilter]:
 
 def scored_evidence(match_filter: MatchFilter, pair: MatchPair, prepared: PairInput) -> Evidence:
     """What the fit knows of a pair when the networks of a filter of full effort have scored it."""
-    result = match_filter.filter_many([pair])[0]
+    return evidence_behind(match_filter.filter_many([pair])[0], match_filter, prepared)
+
+
+def evidence_behind(result: FilterResult, match_filter: MatchFilter, prepared: PairInput) -> Evidence:
+    """What the fit knew of a pair when a filter of full effort answered."""
     margins = result.info["logits"] - np.float32(match_filter.metadata.decision_threshold)
     return gather_scored(
         prepared, result.info["network_rows"], result.scores, margins, result.info["network_essential"]

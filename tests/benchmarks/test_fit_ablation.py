@@ -9,7 +9,17 @@ import pytest
 from conftest import make_scene
 from scene_bundles import write_bundle
 
-from benchmarks.fit_ablation import AS_IT_IS, VARIANTS, ScoredPair, Variant, format_study, main, origin_table
+from benchmarks.fit_ablation import (
+    AS_IT_IS,
+    REPLACED,
+    VARIANTS,
+    ScoredPair,
+    Times,
+    Variant,
+    format_study,
+    main,
+    origin_table,
+)
 from mgca_filter import MatchFilter
 from mgca_filter.evaluation.our_rows import filter_pair
 from mgca_filter.evaluation.pairs import select_pairs
@@ -28,8 +38,9 @@ def test_the_fit_as_it_is_is_what_the_filter_does(
 ) -> None:
     pair = scored.pair
     result = filter_pair(pair, np.arange(len(pair.points1)), str(model_file), options)
-    model = scored.fit(VARIANTS[variant])
+    model, network_ms = scored.fit(VARIANTS[variant])
     assert model is not None
+    assert network_ms == (0.0 if model.ended == "before the network" else scored.network_ms[0])
     np.testing.assert_array_equal(model.R, result.R)
     assert scored.error_deg(model) == pose_error_deg(result.R, result.t, pair.R, pair.t)
     assert model.ended == result.info["ended"]
@@ -44,8 +55,9 @@ def test_the_networks_are_asked_as_the_filter_asks_them(
     pair = select_pairs(tmp_path)[0].source[0]
     scored = ScoredPair.of(pair, [MatchFilter(model=name, effort="full") for name in ("fast", None)])
     result = filter_pair(pair, np.arange(len(pair.points1)), model, {})
-    found = scored.fit(VARIANTS[variant])
+    found, network_ms = scored.fit(VARIANTS[variant])
     assert found is not None
+    assert network_ms == scored.network_ms[len(result.info["networks"]) - 1]
     np.testing.assert_array_equal(found.E, result.info["fitted_essential"])
     assert found.ended == result.info["ended"]
 
@@ -57,16 +69,16 @@ def test_every_variant_but_the_first_changes_something() -> None:
 
 def test_the_table_has_means_and_differences() -> None:
     good, bad = np.array([[1.0, 2.0]]), np.array([[1.0, 180.0]])
-    table = format_study(
-        {AS_IT_IS: {"a": good, "b": good}, "worse": {"a": bad, "b": good}}, {AS_IT_IS: 5.0, "worse": 1.0}
-    )
+    errors = {AS_IT_IS: {"a": good, "b": good}, REPLACED: {"a": bad, "b": good}}
+    table = format_study(errors, {AS_IT_IS: Times([4.0, 6.0], [30.0, 10.0]), REPLACED: Times([10.0], [0.0])})
     first, second = table.splitlines()[2:]
-    assert first == f"| {AS_IT_IS} | 100.0 | 100.0 | 80.0 |  |  | 5.0 |"
-    assert second.startswith("| worse | 75.0 | 75.0 | 62.5 | -25.0 [-50.0, +0.0] | -17.5 [")
+    assert first == f"| {AS_IT_IS} | 100.0 | 100.0 | 80.0 |  |  | 5.0 | 2.50 |"
+    assert second.startswith(f"| {REPLACED} | 75.0 | 75.0 | 62.5 | -25.0 [-50.0, +0.0] | -17.5 [")
+    assert second.endswith("] | 10.0 | 1.00 |")
 
 
 def test_origins_are_counted(scored: ScoredPair) -> None:
-    model = scored.fit(VARIANTS[AS_IT_IS])
+    model, _ = scored.fit(VARIANTS[AS_IT_IS])
     rows = origin_table([model, model, model, None], [1.0, 2.0, 30.0, 180.0]).splitlines()[2:]
     assert rows[0].endswith("| 75 % | 67 % |")
     assert rows[1] == "| none | 25 % | 0 % |"
@@ -77,12 +89,14 @@ def test_command(tmp_path: Path, model_file: Path, capsys: pytest.CaptureFixture
     write_bundle(tmp_path / "hall.npz", [make_scene(seed=4)])
     assert main([str(tmp_path / "hall.npz"), "--model", str(model_file), "--seeds", "0", "1"]) == 0
     study, origins = capsys.readouterr().out.split("\n\n")
-    assert study.count("\n| ") == len(VARIANTS)
+    assert study.count("\n| ") == len(VARIANTS) + 1
     assert "100 %" in origins
     chosen = ["--kinds", "raw", "cross-ratio", "--variants", "PROSAC alone", "--detectors", "SIFT-2000"]
     assert main([str(tmp_path), "--model", str(model_file), *chosen]) == 0
     study, origins = capsys.readouterr().out.split("\n\n")
-    assert [row.split(" | ")[0] for row in study.splitlines()[2:]] == [f"| {AS_IT_IS}", "| PROSAC alone"]
+    assert [row.split(" | ")[0] for row in study.splitlines()[2:]] == [
+        *(f"| {AS_IT_IS}", "| PROSAC alone", f"| {REPLACED}")
+    ]
     assert "100 %" in origins
     assert main([str(tmp_path / "missing.npz")]) == 2
     assert "missing.npz" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from scene_bundles import learned_fields, write_bundle
 from benchmarks import input_kinds
 from benchmarks.input_kinds import ESTIMATORS, OURS, Cell, Comparison, ConfidenceQuality, Mean, Study
 from benchmarks.match_lists import KINDS
+from benchmarks.study import CONFIDENCE_LIMITS
 from mgca_filter.evaluation.baselines import Baseline
 from mgca_filter.evaluation.difficulty import PairProperties
 from mgca_filter.evaluation.methods import PairOutcome
@@ -148,6 +149,11 @@ def test_confidence_is_judged_where_there_is_a_pose() -> None:
     assert quality.right_where_usable == pytest.approx(0.5)
     assert quality.kept_of_right == pytest.approx(0.5)
     assert [one.matches for one in quality.bins] == [2, 1]
+    assert CONFIDENCE_LIMITS[:2] == (0.5, 0.8)
+    assert quality.curve[:2] == [(2 / 3, 1.0), (1.0, 0.5)]
+    assert np.isnan(quality.curve[-1][0])
+    assert quality.curve[-1][1] == 0.0
+    assert quality.to_json()["curve"][-1] == [None, 0.0]
     never = ConfidenceQuality.of([made_up([[180.0] * 4], {}, ("unrelated",) * 4, (None,) * 4)])
     assert never.to_json()["auroc"] is None
     assert never.to_json()["right_where_usable"] is None
