@@ -129,8 +129,21 @@ def magsac(
     pair: RawPair | ScenePair, iterations: int, threshold_px: float = 1.0, confidence: float = 0.999
 ) -> tuple[Any, Any]:
     """The call that the filter replaces, at one pixel unless told otherwise: E and mask."""
-    x1, x2 = normalize_points(pair.points1, pair.K1), normalize_points(pair.points2, pair.K2)
-    threshold = threshold_px / mean_focal_length(pair.K1, pair.K2)
+    return essential_magsac(pair.points1, pair.points2, pair.K1, pair.K2, iterations, threshold_px, confidence)
+
+
+def essential_magsac(
+    points1: FloatArray,
+    points2: FloatArray,
+    K1: FloatArray,
+    K2: FloatArray,
+    iterations: int,
+    threshold_px: float,
+    confidence: float,
+) -> tuple[Any, Any]:
+    """E and mask of matched pixels (N, 2) by USAC_MAGSAC on the normalised image planes."""
+    x1, x2 = normalize_points(points1, K1), normalize_points(points2, K2)
+    threshold = threshold_px / mean_focal_length(K1, K2)
     return cv2.findEssentialMat(x1, x2, np.eye(3), cv2.USAC_MAGSAC, confidence, threshold, iterations)
 
 
@@ -270,10 +283,7 @@ class ListTime:
     @property
     def group(self) -> str:
         """The one of :data:`RATIO_TARGETS` that the list belongs to."""
-        if self.family == RAW:
-            return RAW_NETWORK if self.network_ms > 0 else RAW_EARLY
-        low, high = CLEAR_COUNTS
-        return CLEAR if low <= self.matches <= high and self.right_share >= CLEAR_SHARE else FILTERED
+        return group_of(self.family, self.matches, self.right_share, self.network_ms > 0)
 
 
 CLEAR_COUNTS, CLEAR_SHARE = (200, 1500), 0.7
@@ -283,6 +293,14 @@ RAW_NETWORK, RAW_EARLY, CLEAR, FILTERED = (
 )
 RATIO_TARGETS = {RAW_NETWORK: "0.6", RAW_EARLY: MISSING, CLEAR: "2", FILTERED: "5"}
 """Groups of lists, and the ratio to MAGSAC's time that none should pass."""
+
+
+def group_of(family: str, matches: int, right_share: float, network: bool) -> str:
+    """The one of :data:`RATIO_TARGETS` that a list belongs to, by whether a network was asked for it."""
+    if family == RAW:
+        return RAW_NETWORK if network else RAW_EARLY
+    low, high = CLEAR_COUNTS
+    return CLEAR if low <= matches <= high and right_share >= CLEAR_SHARE else FILTERED
 
 
 LENGTHS = (350, 750, 1250, CLEAR_COUNTS[1] + 1)

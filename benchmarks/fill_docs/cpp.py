@@ -20,8 +20,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark and fill its place."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--build", type=Path, required=True, metavar="FOLDER", help="where cpp/ was built")
+    parser.add_argument("--bundles", nargs="+", default=[], metavar="FOLDER", help="scene bundles, for real pairs")
     options = parser.parse_args(arguments)
-    table = run(("-m", "benchmarks.cpp_speed", "--build", str(options.build)))
+    bundles = ("--bundles", *options.bundles) if options.bundles else ()
+    table = run(("-m", "benchmarks.cpp_speed", "--build", str(options.build), *bundles))
     fill_file(PAGE, {"speed": f"{table}\n\n{provenance()}"})
 
 

@@ -2,8 +2,8 @@
 //
 //     time_pairs MODEL FIRST_LOOK PAIRS
 //
-// PAIRS holds, for each pair: the numbers of keypoints 1, keypoints 2 and rows; fx, fy, cx, cy, or zeros without intrinsics;
-// x, y, size and angle of each keypoint; first and second candidate of each row: index in image 2 and distance, the index -1
+// PAIRS holds, for each pair: the numbers of keypoints 1, keypoints 2 and rows; fx, fy, cx, cy of each camera, or zeros without
+// intrinsics; x, y, size and angle of each keypoint; first and second candidate of each row: index in image 2 and distance, the index -1
 // where there is no second. Row i is of keypoint `query`, its first number. Input is the number of a pair and 1 for
 // effort=full, else 0; output milliseconds of the processor, status and number of kept matches. What an OpenCV program holds is what is
 // timed: keypoints and matches are converted within the time.
@@ -25,7 +25,7 @@ namespace {
 struct Pair {
     std::vector<cv::KeyPoint> keypoints1, keypoints2;
     std::vector<std::vector<cv::DMatch>> rows;
-    mgca::Camera camera;
+    mgca::Camera camera1, camera2;
 };
 
 std::vector<cv::KeyPoint> read_keypoints(std::istream& in, std::size_t count) {
@@ -36,17 +36,20 @@ std::vector<cv::KeyPoint> read_keypoints(std::istream& in, std::size_t count) {
     return keypoints;
 }
 
+mgca::Camera read_camera(std::istream& in) {
+    double fx = 0.0, fy = 0.0, cx = 0.0, cy = 0.0;
+    in >> fx >> fy >> cx >> cy;
+    return fx > 0.0 ? mgca::Camera(cv::Matx33d(fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)) : mgca::Camera();
+}
+
 std::vector<Pair> read_pairs(const char* file) {
     std::ifstream in(file);
     std::vector<Pair> pairs;
     std::size_t count1 = 0, count2 = 0, count = 0;
     while (in >> count1 >> count2 >> count) {
         Pair pair;
-        double fx = 0.0, fy = 0.0, cx = 0.0, cy = 0.0;
-        in >> fx >> fy >> cx >> cy;
-        if (fx > 0.0) {
-            pair.camera = cv::Matx33d(fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0);
-        }
+        pair.camera1 = read_camera(in);
+        pair.camera2 = read_camera(in);
         pair.keypoints1 = read_keypoints(in, count1);
         pair.keypoints2 = read_keypoints(in, count2);
         for (std::size_t i = 0; i < count; ++i) {
@@ -86,7 +89,7 @@ int main(int argc, char** argv) {
             const Pair& pair = pairs.at(index);
             const std::clock_t started = std::clock();
             const mgca::Result result =
-                filters[effort == 1 ? 1 : 0](pair.keypoints1, pair.keypoints2, pair.rows, pair.camera);
+                filters[effort == 1 ? 1 : 0](pair.keypoints1, pair.keypoints2, pair.rows, pair.camera1, pair.camera2);
             const double elapsed_ms = 1e3 * static_cast<double>(std::clock() - started) / CLOCKS_PER_SEC;
             std::cout << elapsed_ms << " " << mgca::to_string(result.status) << " " << result.num_inliers
                       << std::endl;
