@@ -1,7 +1,8 @@
 """Can the status be trusted? ``python -m benchmarks.verdicts PHOTOS --bundles BUNDLES``.
 
 Two questions, each with intrinsics given and without: how many pairs of photographs that show different places come
-out as ``ok``, and how many true pairs whose pose the fit had solved are turned into something else.
+out as ``ok``, and how many true pairs whose pose the fit had solved are doubted (``low_support``, with the pose) or
+lost (any status but that, ``ok`` and ``planar``).
 """
 
 from __future__ import annotations
@@ -206,10 +207,11 @@ def format_table(judged: Sequence[Judged]) -> str:
             if not rows:
                 continue
             counts = Counter(row.status for row in rows)
-            trusted = sum(counts[status] for status in TRUSTED)
+            doubted = counts[Status.LOW_SUPPORT.value]
+            lost = len(rows) - doubted - sum(counts[status] for status in TRUSTED)
             kind = f"true, solved within {SOLVED_DEG:.0f}°" if related else "unrelated"
             share = (
-                f"{100.0 * (1.0 - trusted / len(rows)):.1f} % lost"
+                f"{100.0 * lost / len(rows):.1f} % lost, {100.0 * doubted / len(rows):.1f} % doubted"
                 if related
                 else f"{100.0 * counts['ok'] / len(rows):.1f} % false ok"
             )

@@ -79,7 +79,7 @@ def test_table_tells_false_from_lost() -> None:
     rows += [verdicts.Judged("c", True, "given", "unrelated", 11.0)]
     unrelated, true = verdicts.format_table(rows).splitlines()[2:]
     assert "25.0 % false ok" in unrelated
-    assert "50.0 % lost" in true
+    assert "25.0 % lost, 25.0 % doubted" in true
     assert "| 4 |" in true
 
 
