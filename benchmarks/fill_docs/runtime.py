@@ -1,7 +1,7 @@
 """Measure speed, memory and parity anew for ``docs/runtime.md``: ``python -m benchmarks.fill_docs.runtime``.
 
 Each place of the page holds what one command prints. The machine has to be idle. With ``--bundles``
-parity is shown on candidates of real pairs as well.
+parity is shown on candidates of real pairs as well; the place of the lists wants ``--lists``.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ PAGE = ROOT / "docs" / "runtime.md"
 COMMANDS = {
     "one_thread": ("-m", "benchmarks.speed", "--threads", "1"),
     "two_threads": ("-m", "benchmarks.speed", "--threads", "2"),
+    "lists": ("-m", "benchmarks.speed", "--per-scene", "1"),
     "opening": ("-m", "benchmarks.opening"),
     "scaling": ("-m", "benchmarks.profile_network", "--scaling", "--threads", "1"),
     "profile_500": ("-m", "benchmarks.profile_network", "--count", "500", "--threads", "1"),
@@ -44,10 +45,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the commands that were asked for, all by default, and fill their places one by one."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bundles", type=Path, help="scene bundles for the parity on real pairs")
+    parser.add_argument(
+        "--lists", nargs="+", metavar="FOLDER", help="scene bundles of several detectors, for the lists"
+    )
     parser.add_argument("--only", nargs="+", choices=tuple(COMMANDS), metavar="PLACE", help="these places alone")
     options = parser.parse_args(arguments)
-    for name in options.only or COMMANDS:
+    names = options.only or tuple(COMMANDS)
+    if options.lists is None and "lists" in names:
+        parser.error("--lists: the place of the lists needs them; --only leaves it out")
+    for name in names:
         command = COMMANDS[name]
+        if name == "lists":
+            command = (*command, "--bundles", *options.lists)
         if name == "parity" and options.bundles:
             command = (*command, "--bundles", str(options.bundles))
         print(name, file=sys.stderr, flush=True)

@@ -28,13 +28,15 @@ def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_every_command_has_its_place_on_the_page(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(runtime, "run", lambda command: "| " + " ".join(command) + " |")
-    runtime.main(["--bundles", "B"])
+    runtime.main(["--bundles", "B", "--lists", "C", "D"])
     before = page.read_text(encoding="utf-8")
     for name, command in runtime.COMMANDS.items():
-        words = " ".join(command) + (" --bundles B" if name == "parity" else "")
+        words = " ".join(command) + {"parity": " --bundles B", "lists": " --bundles C D"}.get(name, "")
         assert f"<!-- {name} -->\n| {words} |\n\n`mgca_small.onnx` " in before
     runtime.main(["--only", "parity"])
     assert page.read_text(encoding="utf-8") == before.replace(" --bundles B |", " |")
+    with pytest.raises(SystemExit):
+        runtime.main(["--bundles", "B"])
 
 
 @pytest.mark.slow
