@@ -126,11 +126,15 @@ def product_flops(event: dict[str, Any]) -> float:
         return 0.0
     inputs = [next(iter(shape.values())) for shape in event["args"]["input_type_shape"]]
     output = next(iter(event["args"]["output_type_shape"][0].values()))
+    *batch, rows, _ = (1, 1, *output)[-max(2, len(output)) :]
+    shape1 = inputs[0]
     if len(inputs) == 1:  # packed weights are not listed
-        return 2.0 * float(np.prod(output)) * float(inputs[0][-1])
-    # |A| |B| / |Y| is the square of the inner size, whichever side is transposed.
-    inner = np.sqrt(np.prod(inputs[0]) * np.prod(inputs[1]) / np.prod(output))
-    return 2.0 * float(np.prod(output) * inner)
+        inner = shape1[-2] if shape1[-1] == rows and len(shape1) > 1 else shape1[-1]
+        return 2.0 * float(np.prod(output)) * float(inner)
+    # Either side may be transposed, or the same for the whole batch.
+    candidates = (np.prod(shape1) // (np.prod(batch, dtype=int) * rows), np.prod(shape1) // rows)
+    inner = next(size for size in candidates if size in shape1 and size in inputs[1])
+    return 2.0 * float(np.prod(output)) * float(inner)
 
 
 def costs(events: list[dict[str, Any]], repeats: int, by_part: bool) -> dict[str, Cost]:

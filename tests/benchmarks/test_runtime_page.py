@@ -30,8 +30,9 @@ def test_every_command_has_its_place_on_the_page(page: Path, monkeypatch: pytest
     monkeypatch.setattr(runtime, "run", lambda command: "| " + " ".join(command) + " |")
     runtime.main(["--bundles", "B", "--lists", "C", "D"])
     before = page.read_text(encoding="utf-8")
+    lists = " --bundles C D"
     for name, command in runtime.COMMANDS.items():
-        words = " ".join(command) + {"parity": " --bundles B", "lists": " --bundles C D"}.get(name, "")
+        words = " ".join(command) + {"parity": " --bundles B", "lists": lists, "lists_fast": lists}.get(name, "")
         assert f"<!-- {name} -->\n| {words} |\n\n`mgca_small.onnx` " in before
     runtime.main(["--only", "parity"])
     assert page.read_text(encoding="utf-8") == before.replace(" --bundles B |", " |")
