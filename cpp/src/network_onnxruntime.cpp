@@ -20,9 +20,10 @@ constexpr const char* kCpu = "CPUExecutionProvider";
 struct FullPrecision {
     const char *provider, *option, *value;
 };
-constexpr std::array<FullPrecision, 3> kFullPrecision{{{"OpenVINOExecutionProvider", "precision", "FP32"},
-                                                       {"CUDAExecutionProvider", "use_tf32", "0"},
+constexpr std::array<FullPrecision, 2> kFullPrecision{{{"CUDAExecutionProvider", "use_tf32", "0"},
                                                        {"TensorrtExecutionProvider", "trt_fp16_enable", "0"}}};
+// Ends the process while it reads the graph's loops.
+constexpr const char* kRefused = "OpenVINOExecutionProvider";
 constexpr std::array<const char*, 2> kInputNames{"correspondences", "attributes"};
 constexpr std::array<const char*, 2> kOutputNames{"logits", "essential"};
 
@@ -99,14 +100,18 @@ public:
         std::string missing, reason;
         const std::vector<std::string> available = Ort::GetAvailableProviders();
         for (const std::string& name : options.providers) {
-            if (std::find(available.begin(), available.end(), name) != available.end()) {
-                usable.push_back(name);
-            } else {
+            if (std::find(available.begin(), available.end(), name) == available.end()) {
                 missing += (missing.empty() ? "" : ", ") + name;
+            } else if (name == kRefused) {
+                reason = name + " does not run the network's loops";
+            } else {
+                usable.push_back(name);
             }
         }
         if (!missing.empty()) {
-            reason = "this ONNX Runtime has no " + missing;
+            reason = "this ONNX Runtime has no " + missing + (reason.empty() ? "" : "; ") + reason;
+        }
+        if (!reason.empty()) {
             refuse(options, reason);
         }
         if (!usable.empty() && usable != std::vector<std::string>{kCpu}) {

@@ -1,10 +1,10 @@
 """Do all runtimes say the same? ``python -m mgca_filter.export.parity [MODEL.onnx] [--bundles FOLDER]``.
 
-PyTorch is the reference; ONNX Runtime, OpenCV's DNN module and OpenVINO (``pip install openvino``) are compared with
-it, each where it is installed. Neighbours and the better half of the matches are chosen by comparison, so the network
-is not continuous: where two distances agree to seven digits, two runtimes choose differently, and the logits of some
-matches differ in the second digit. The last rows show what that means: PyTorch against itself, with every coordinate
-moved by one unit in the last place.
+PyTorch is the reference; ONNX Runtime and OpenCV's DNN module are compared with it, each where it is installed.
+Neighbours and the better half of the matches are chosen by comparison, so the network is not continuous: where two
+distances agree to seven digits, two runtimes choose differently, and the logits of some matches differ in the second
+digit. The last rows show what that means: PyTorch against itself, with every coordinate moved by one unit in the last
+place.
 """
 
 from __future__ import annotations
@@ -147,23 +147,6 @@ def _figures(row: ParityRow) -> str:
     return f"{row.logit_difference:.1e} | {row.quantile_90:.1e} | {different} | {row.flipped}"
 
 
-class OpenVinoRuntime:
-    """The ONNX file in OpenVINO, in full precision on the CPU; ImportError where it is not installed."""
-
-    name = "openvino"
-
-    def __init__(self, path: Path) -> None:
-        import openvino
-
-        self.metadata = open_backend(path, "onnxruntime").metadata
-        self._model = openvino.Core().compile_model(str(path), "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
-
-    def infer(self, correspondences: Float32Array, attributes: Float32Array) -> Inputs:
-        """One forward pass, as of the package's backends."""
-        outputs = self._model({"correspondences": correspondences, "attributes": attributes})
-        return np.array(outputs["logits"]), np.array(outputs["essential"])
-
-
 class MovedByAnUlp:
     """A backend whose input is moved by one unit in the last place, each coordinate up or down at random."""
 
@@ -185,10 +168,6 @@ def open_runtimes(path: Path) -> list[Backend]:
             runtimes.append(open_backend(path, name))
         except BackendError as error:
             print(f"without {name}: {error}", file=sys.stderr)
-    try:
-        runtimes.append(OpenVinoRuntime(path))
-    except ImportError as error:
-        print(f"without openvino: {error}", file=sys.stderr)
     return runtimes
 
 

@@ -26,10 +26,12 @@ _DISABLED_OPTIMIZERS = ["MatMulScaleFusion"]
 # Squaring a matrix twenty times, the heart of the eight-point algorithm, is beyond half precision and TF32: providers
 # that would use them by default are told not to. What the caller sets stays. In the providers' own names.
 _FULL_PRECISION = {
-    "OpenVINOExecutionProvider": {"precision": "FP32"},
     "CUDAExecutionProvider": {"use_tf32": "0"},
     "TensorrtExecutionProvider": {"trt_fp16_enable": "0"},
 }
+# As a provider (ONNX Runtime 1.24) OpenVINO ends the process while it reads the graph's loops; by itself it refuses them
+# (2026.0 to 2026.4) or answers wrongly (2024.6, 2025.4).
+_REFUSED = ("OpenVINOExecutionProvider",)
 PROVIDERS_VARIABLE = "MGCA_FILTER_PROVIDERS"
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"
 TELEMETRY_VARIABLE = "ORT_DISABLE_TELEMETRY"
@@ -43,8 +45,8 @@ class OnnxBackend:
     Args:
         path: the ``.onnx`` file.
         providers: execution providers in ONNX Runtime's form; None = those that the environment variable
-            ``MGCA_FILTER_PROVIDERS`` lists, separated by commas, else the CPU. One that is missing or fails gives
-            way to the CPU with one warning.
+            ``MGCA_FILTER_PROVIDERS`` lists, separated by commas, else the CPU. One that is missing, fails, or is
+            known not to run the network (OpenVINO) gives way to the CPU with one warning.
 
     Raises:
         ModelError: the file is missing, truncated, or of another contract.
@@ -113,20 +115,24 @@ def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) ->
     """Open what was read with the wanted providers, else on the CPU with one warning."""
     options = _session_options(runtime)
     wanted = list(providers) if providers else os.environ.get(PROVIDERS_VARIABLE, CPU_PROVIDER).split(",")
-    names = [provider if isinstance(provider, str) else provider[0] for provider in wanted]
-    missing = [name for name in names if name not in runtime.get_available_providers()]
-    usable = [provider for provider, name in zip(wanted, names) if name not in missing]
-    reason = f"this ONNX Runtime has no {', '.join(missing)}" if missing else ""
+    names = [_name_of(provider) for provider in wanted]
+    available = runtime.get_available_providers()
+    missing = [name for name in names if name not in available]
+    refused = [name for name in names if name in _REFUSED and name in available]
+    usable = [provider for provider, name in zip(wanted, names) if name not in (*missing, *refused)]
+    reasons = [f"this ONNX Runtime has no {', '.join(missing)}"] if missing else []
+    reasons += [f"{name} does not run the network's loops" for name in refused]
+    reason = "; ".join(reasons)
     if usable and usable != [CPU_PROVIDER]:
         try:
             session = _open_in_full_precision(runtime, file, options, usable)
-            lost = [name for name in names if name not in missing and name not in session.get_providers()]
+            lost = [name for name in names if name not in (*missing, *refused, *session.get_providers())]
             reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
             if reason:
                 _warn_about_provider(reason)
             return session
         except Exception as error:
-            reason = f"{names[0]} failed ({error})"
+            reason = f"{_name_of(usable[0])} failed ({error})"
     if reason:
         _warn_about_provider(reason)
     try:
@@ -137,6 +143,10 @@ def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) ->
         if type(error).__name__ in _FILE_ERRORS:
             raise ModelError(f"{file.path}: not a readable ONNX model, truncated or damaged ({error})") from error
         raise BackendError(f"ONNX Runtime cannot start ({error})") from error
+
+
+def _name_of(provider: Any) -> str:
+    return str(provider if isinstance(provider, str) else provider[0])
 
 
 def _open_in_full_precision(runtime: Any, file: ModelFile, options: Any, providers: list[Any]) -> Any:

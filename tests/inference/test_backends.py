@@ -366,7 +366,10 @@ class RuntimeWithProviders:
         return getattr(onnxruntime, name)
 
     def get_available_providers(self) -> list[str]:
-        return ["OpenVINOExecutionProvider", "CUDAExecutionProvider", "OtherProvider", "CPUExecutionProvider"]
+        return [
+            *("OpenVINOExecutionProvider", "CUDAExecutionProvider", "TensorrtExecutionProvider"),
+            *("OtherProvider", "CPUExecutionProvider"),
+        ]
 
     def InferenceSession(self, content: bytes, options: object, providers: list, **_: object) -> object:  # noqa: N802
         self.opened.append(providers)
@@ -379,10 +382,10 @@ class RuntimeWithProviders:
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        ("OpenVINOExecutionProvider", ("OpenVINOExecutionProvider", {"precision": "FP32"})),
+        ("TensorrtExecutionProvider", ("TensorrtExecutionProvider", {"trt_fp16_enable": "0"})),
         (
-            ("OpenVINOExecutionProvider", {"precision": "FP16", "device_type": "GPU"}),
-            ("OpenVINOExecutionProvider", {"precision": "FP16", "device_type": "GPU"}),
+            ("TensorrtExecutionProvider", {"trt_fp16_enable": "1", "device_id": 1}),
+            ("TensorrtExecutionProvider", {"trt_fp16_enable": "1", "device_id": 1}),
         ),
         (("CUDAExecutionProvider", {"device_id": 1}), ("CUDAExecutionProvider", {"use_tf32": "0", "device_id": 1})),
         ("OtherProvider", "OtherProvider"),
@@ -404,3 +407,19 @@ def test_a_provider_that_does_not_know_the_option_is_used_as_it_is(model_file: P
         warnings.simplefilter("error")
         OnnxBackend(model_file, ["CUDAExecutionProvider"])
     assert runtime.opened == [[("CUDAExecutionProvider", {"use_tf32": "0"})], ["CUDAExecutionProvider"]]
+
+
+@pytest.mark.parametrize(
+    ("asked", "opened"),
+    [
+        (["OpenVINOExecutionProvider"], ["CPUExecutionProvider"]),
+        ([("OpenVINOExecutionProvider", {"device_type": "CPU"}), "CPUExecutionProvider"], ["CPUExecutionProvider"]),
+        (["OpenVINOExecutionProvider", "OtherProvider"], ["OtherProvider"]),
+    ],
+)
+def test_a_provider_that_ends_the_process_is_never_started(model_file: Path, monkeypatch, asked, opened) -> None:
+    runtime = RuntimeWithProviders()
+    monkeypatch.setattr(onnxruntime_backend, "_import_runtime", lambda: runtime)
+    with pytest.warns(RuntimeWarning, match="OpenVINOExecutionProvider does not run the network's loops"):
+        OnnxBackend(model_file, asked)
+    assert runtime.opened == [opened]
