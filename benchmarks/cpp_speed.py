@@ -37,7 +37,7 @@ from mgca_filter.fit.evidence import FIRM_MATCHES
 from mgca_filter.tables import render_table
 
 from .match_lists import KINDS, open_detector_scenes
-from .speed import essential_magsac, group_of
+from .speed import MAGSAC_OPTIONS, essential_magsac, group_of
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = 0.8
@@ -72,9 +72,10 @@ class TimedPair:
         points1 = np.array([self.keypoints1[match.queryIdx].pt for match in matches])
         points2 = np.array([self.keypoints2[match.trainIdx].pt for match in matches])
         if self.K1 is None or self.K2 is None:
-            cv2.findFundamentalMat(points1, points2, cv2.USAC_MAGSAC, 0.5, 0.9999, 5000)
+            iterations, threshold_px, confidence = MAGSAC_OPTIONS
+            cv2.findFundamentalMat(points1, points2, cv2.USAC_MAGSAC, threshold_px, confidence, iterations)
         else:
-            essential_magsac(points1, points2, self.K1, self.K2, 5000, 0.5, 0.9999)
+            essential_magsac(points1, points2, self.K1, self.K2, *MAGSAC_OPTIONS)
 
 
 @dataclass(frozen=True)

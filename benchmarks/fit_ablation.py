@@ -39,7 +39,7 @@ from mgca_filter.match_filter import MatchFilter
 from mgca_filter.tables import render_table
 
 from .match_lists import KINDS, open_detector_scenes
-from .speed import answer_error_deg, magsac
+from .speed import MAGSAC_OPTIONS, answer_error_deg, magsac
 from .study import match_pair, run_study, study_parser
 
 STATISTICS = ("mAP@5", "mAP@20", "AUC@5")
@@ -225,7 +225,7 @@ def run(options: argparse.Namespace) -> int:
                         models.append(model)
                         first_errors.append(row[-1])
             started = time.process_time()
-            answer = magsac(scored.pair, 5000, 0.5, 0.9999)
+            answer = magsac(scored.pair, *MAGSAC_OPTIONS)
             times[REPLACED].fit.append(1e3 * (time.process_time() - started))
             times[REPLACED].networks.append(0.0)
             error = answer_error_deg(scored.pair, answer)

@@ -126,7 +126,7 @@ def _open_session(runtime: Any, file: ModelFile, providers: Providers | None) ->
     if usable and usable != [CPU_PROVIDER]:
         try:
             session = _open_in_full_precision(runtime, file, options, usable)
-            lost = [name for name in names if name not in (*missing, *refused, *session.get_providers())]
+            lost = [name for name in map(_name_of, usable) if name not in session.get_providers()]
             reason = reason or (f"{', '.join(lost)} did not start" if lost else "")
             if reason:
                 _warn_about_provider(reason)
@@ -164,7 +164,7 @@ def _open_in_full_precision(runtime: Any, file: ModelFile, options: Any, provide
 
 def _in_full_precision(provider: str | tuple[str, dict[str, Any]]) -> str | tuple[str, dict[str, Any]]:
     """A provider with the options that keep it in float32 in front of the caller's."""
-    name, options = (provider, {}) if isinstance(provider, str) else provider
+    name, options = _name_of(provider), {} if isinstance(provider, str) else provider[1]
     precision = _FULL_PRECISION.get(name)
     return provider if precision is None else (name, {**precision, **options})
 
