@@ -31,13 +31,11 @@ from mgca_filter import MatchFilter, model_path
 from mgca_filter.data.scene_bundle import ScenePair
 from mgca_filter.evaluation.environment import CpuMeter, one_thread
 from mgca_filter.evaluation.metrics import true_matches
-from mgca_filter.evaluation.pairs import sample_pairs
 from mgca_filter.features import create_detector, detect_keypoints, match_descriptors
-from mgca_filter.fit.evidence import FIRM_MATCHES
 from mgca_filter.tables import render_table
 
-from .match_lists import KINDS, open_detector_scenes
-from .speed import MAGSAC_OPTIONS, essential_magsac, group_of
+from .match_lists import open_detector_scenes
+from .speed import MAGSAC_OPTIONS, essential_magsac, group_of, timed_lists
 
 ROOT = Path(__file__).resolve().parent.parent
 TARGET = 0.8
@@ -120,18 +118,12 @@ def bundle_pairs(bundles: Sequence[Path], per_scene: int) -> list[TimedPair]:
     """Lists of the pairs of scene bundles, raw and filtered, by the groups of ``benchmarks.speed``."""
     match_filter = MatchFilter(backend="onnxruntime")
     pairs = []
-    for scene in open_detector_scenes(bundles, per_scene=per_scene):
-        for kind in (KINDS["raw"], KINDS["cross-ratio"]):
-            selection = scene.lists(kind)
-            for pair in [] if selection is None else sample_pairs([selection], len(selection)):
-                if len(pair.points1) < FIRM_MATCHES:
-                    continue
-                timed = _as_opencv_holds_it(pair)
-                result = match_filter.filter(*timed.given, K1=timed.K1, K2=timed.K2)
-                right = true_matches(pair.correspondences, pair.E)
-                network_ms = result.info["timings_ms"].get("network", 0.0)
-                group = group_of(kind.family, len(right), float(right.mean()), network_ms > 0)
-                pairs.append(replace(timed, group=group))
+    for family, pair in timed_lists(open_detector_scenes(bundles, per_scene=per_scene), ("raw", "cross-ratio")):
+        timed = _as_opencv_holds_it(pair)
+        result = match_filter.filter(*timed.given, K1=timed.K1, K2=timed.K2)
+        right = true_matches(pair.correspondences, pair.E)
+        network_ms = result.info["timings_ms"].get("network", 0.0)
+        pairs.append(replace(timed, group=group_of(family, len(right), float(right.mean()), network_ms > 0)))
     return pairs
 
 

@@ -20,7 +20,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -314,18 +314,18 @@ def time_lists(
 ) -> list[ListTime]:
     """Times on every kind of list of every pair, or on some; lists of fewer than eight matches are left out."""
     match_filter = MatchFilter(model=model, backend="onnxruntime")
-    times = []
-    for scene in tqdm(scenes, disable=None, unit=" bundles"):
-        selections = [
-            (kind, selection)
-            for kind in map(KINDS.get, kinds)
-            if kind is not None and (selection := scene.lists(kind)) is not None
-        ]
-        for kind, selection in selections:
-            for pair in sample_pairs([selection], len(selection)):
+    lists = timed_lists(tqdm(scenes, disable=None, unit=" bundles"), kinds)
+    return [time_list(match_filter, pair, family, repeats) for family, pair in lists]
+
+
+def timed_lists(scenes: Iterable[DetectorScene], kinds: Iterable[str]) -> Iterator[tuple[str, ScenePair]]:
+    """Family and pair of every list of these kinds; those of fewer than eight matches are left out."""
+    for scene in scenes:
+        for kind in (KINDS[name] for name in kinds):
+            selection = scene.lists(kind)
+            for pair in () if selection is None else sample_pairs([selection], len(selection)):
                 if len(pair.points1) >= FIRM_MATCHES:
-                    times.append(time_list(match_filter, pair, kind.family, repeats))
-    return times
+                    yield kind.family, pair
 
 
 def time_list(match_filter: MatchFilter, pair: ScenePair, family: str, repeats: int) -> ListTime:
