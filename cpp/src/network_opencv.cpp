@@ -7,7 +7,6 @@
 
 #include <array>
 #include <mutex>
-#include <vector>
 
 namespace mgca::detail {
 namespace {
@@ -26,17 +25,13 @@ public:
 
     NetworkOutput infer(std::vector<float>& correspondences, std::vector<float>& attributes) const override {
         const int count = static_cast<int>(attributes.size() / kAttributeCount);
+        const std::array<int, 3> shape1{1, count, 4}, shape2{1, count, static_cast<int>(kAttributeCount)};
         try {
             const std::lock_guard<std::mutex> lock(mutex_);
-            // OpenCV 5.0 lays out the body of a Loop anew only where the shape of the input is another than in the pass
-            // before; without that the blocks in which neighbours are searched begin with buffers of the last, shorter one.
-            if (count == count_ && count > 1) {
-                std::array<float, 4> correspondence{};
-                std::array<float, kAttributeCount> one{};
-                forward(correspondence.data(), one.data(), 1);
-            }
-            count_ = count;
-            const std::vector<cv::Mat> outputs = forward(correspondences.data(), attributes.data(), count);
+            net_.setInput(cv::Mat(3, shape1.data(), CV_32F, correspondences.data()), "correspondences");
+            net_.setInput(cv::Mat(3, shape2.data(), CV_32F, attributes.data()), "attributes");
+            std::vector<cv::Mat> outputs;
+            net_.forward(outputs, std::vector<cv::String>{"logits", "essential"});
             const float* logits = outputs[0].ptr<float>();
             return {{logits, logits + count}, cv::Matx33d(cv::Matx33f(outputs[1].ptr<float>()))};
         } catch (const cv::Exception& error) {
@@ -45,18 +40,8 @@ public:
     }
 
 private:
-    std::vector<cv::Mat> forward(float* correspondences, float* attributes, int count) const {
-        const std::array<int, 3> shape1{1, count, 4}, shape2{1, count, static_cast<int>(kAttributeCount)};
-        net_.setInput(cv::Mat(3, shape1.data(), CV_32F, correspondences), "correspondences");
-        net_.setInput(cv::Mat(3, shape2.data(), CV_32F, attributes), "attributes");
-        std::vector<cv::Mat> outputs;
-        net_.forward(outputs, std::vector<cv::String>{"logits", "essential"});
-        return outputs;
-    }
-
     mutable std::mutex mutex_;  // a cv::dnn::Net keeps its blobs between calls
     mutable cv::dnn::Net net_;
-    mutable int count_ = 0;  // matches of the pass before
 };
 
 }  // namespace

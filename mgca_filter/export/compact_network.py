@@ -381,8 +381,9 @@ def nearest_rows(features: Tensor, k: int) -> Tensor:
     """
     *outer, count, channels = features.shape
     x = features - features.mean(-2, keepdim=True)
-    penalty = x.square() @ torch.full((channels, 1), -0.5)
-    keys = torch.cat([F.pad(x, (0, 0, 0, k)), F.pad(penalty, (0, 0, 0, k), value=-FAR)], -1)  # (..., N + k, C + 1)
+    padded = F.pad(x, (0, 0, 0, k), value=FAR**0.5)
+    penalty = padded.square() @ torch.full((channels, 1), -0.5)
+    keys = torch.cat([padded, penalty], -1)  # (..., N + k, C + 1)
     nearness = F.pad(x, (0, 1), value=1.0) @ keys.transpose(-1, -2)
     indices = nearness.topk(k, dim=-1).indices
     own = torch.arange(count).view(-1, 1)

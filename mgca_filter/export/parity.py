@@ -1,6 +1,7 @@
 """Do all runtimes say the same? ``python -m mgca_filter.export.parity [MODEL.onnx] [--bundles FOLDER]``.
 
-PyTorch is the reference; ONNX Runtime and OpenCV's DNN module are compared with it, each where it is installed.
+PyTorch is the reference; ONNX Runtime and OpenCV's DNN module are compared with it, each where it is installed. With
+``--reference OTHER.onnx`` it is another file in ONNX Runtime: an export before this one, say.
 Neighbours and the better half of the matches are chosen by comparison, so the network is not continuous: where two
 distances agree to seven digits, two runtimes choose differently, and the logits of some matches differ in the second
 digit. The last rows show what that means: PyTorch against itself, with every coordinate moved by one unit in the last
@@ -191,16 +192,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=MORE_COUNTS, help="matches per synthetic pair")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS, help="one synthetic pair each")
     parser.add_argument("--bundles", type=Path, help="folder of scene bundles: candidates of real pairs as well")
+    parser.add_argument("--reference", type=Path, metavar="ONNX", help="compare with this file instead of PyTorch")
     options = parser.parse_args(arguments)
-    torch_backend = open_backend(options.model, "torch")
-    runtimes = [*open_runtimes(options.model), MovedByAnUlp(torch_backend)]
-    rows = [compare(runtime, torch_backend, n, options.seeds) for runtime in runtimes for n in options.counts]
+    reference = open_backend(options.reference or options.model, "onnxruntime" if options.reference else "torch")
+    runtimes = [*open_runtimes(options.model), MovedByAnUlp(reference)]
+    rows = [compare(runtime, reference, n, options.seeds) for runtime in runtimes for n in options.counts]
     print(format_parity(rows))
     if options.bundles:
         inputs = real_inputs(options.model, options.bundles)
         print(f"\nCandidates of {len(inputs)} real pairs:\n")
-        print(format_real_pairs([compare_on(runtime, torch_backend, inputs) for runtime in runtimes]))
-    return 0 if all(row.passed for row in rows if not row.runtime.startswith("torch")) else 1
+        print(format_real_pairs([compare_on(runtime, reference, inputs) for runtime in runtimes]))
+    return 0 if all(row.passed for row in rows if not row.runtime.startswith(reference.name + ",")) else 1
 
 
 if __name__ == "__main__":

@@ -134,7 +134,7 @@ class LoopRoller:
         end = roll.start + roll.period * roll.count
         first, last = nodes[roll.start : roll.start + roll.period], nodes[end - roll.period : end]
         name = first[0].output[0]
-        turn, on = f"{name}_turn", f"{name}_on"
+        turn, on, stays = f"{name}_turn", f"{name}_on", f"{name}_stays"
         inside = dict[tuple[str, ...], str]()
         body = self._constants_of_turn(roll, name, turn, inside)
         for number, carried in enumerate(roll.carried):
@@ -147,18 +147,22 @@ class LoopRoller:
                     copy.input[slot] = inside[roll.replaced[index, slot]]
             body.append(copy)
         states = [state for _, state in roll.carried]
+        body.append(helper.make_node("Identity", [on], [stays], stays))  # OpenVINO wants an output of its own
         made = {
             output: final for node, end_node in zip(first, last) for output, final in zip(node.output, end_node.output)
         }
         graph = helper.make_graph(
-            self._rolled(body, set(states)),
+            self._rolled(body, {stays, *states}),
             f"{name}_step",
             [
                 helper.make_tensor_value_info(turn, TensorProto.INT64, []),
                 helper.make_tensor_value_info(on, TensorProto.BOOL, []),
                 *(self._value(inside[carried], carried[1]) for carried in roll.carried),
             ],
-            [helper.make_tensor_value_info(on, TensorProto.BOOL, []), *(self._value(state, state) for state in states)],
+            [
+                helper.make_tensor_value_info(stays, TensorProto.BOOL, []),
+                *(self._value(state, state) for state in states),
+            ],
         )
         count = self._constant(f"turns_{roll.count}", np.array(roll.count, np.int64))
         starts, finals = [start for start, _ in roll.carried], [made[state] for state in states]
@@ -166,31 +170,43 @@ class LoopRoller:
         return [*nodes[: roll.start], loop, *nodes[end:]]
 
     def _constants_of_turn(self, roll: _Roll, name: str, turn: str, inside: dict[tuple[str, ...], str]) -> list[Any]:
-        """Nodes that give a step its constants, and in ``inside`` their names: slices of one row for each step."""
-        if not roll.stacked:
-            return []
-        nodes, splits, widths = [], list[str](), list[int]()
-        values = [[self._constants[item] for item in constants] for constants in roll.stacked]
-        rows = np.stack([np.concatenate([value[step].ravel() for value in values]) for step in range(roll.count)])
+        """Nodes that give a step its constants, and in ``inside`` their names.
+
+        Each is taken out of a stack of its own, or all are slices of one row for each step: whichever is fewer nodes.
+        """
+        stacks = dict[Any, Array]()
+        for constants in roll.stacked:
+            stack = np.stack([self._constants[item] for item in constants])
+            key = stack.shape, stack.tobytes()
+            stacks.setdefault(key, stack)
+            inside[constants] = f"{name}_of_turn_{list(stacks).index(key)}"
+        sliced = 3 + sum(stack.ndim != 2 for stack in stacks.values())
+        nodes, splits = list[Any](), list[str]()
+        if 2 * len(stacks) <= sliced:
+            for number, stack in enumerate(stacks.values()):
+                taken = f"{name}_taken_{number}"
+                nodes.append(self._taken(stack, turn, taken))
+                nodes.append(self._reshaped(taken, stack.shape[1:], f"{name}_of_turn_{number}"))
+            return nodes
         taken, row = f"{name}_taken", f"{name}_row"
-        nodes.append(helper.make_node("Gather", [self._constant(f"{name}_rows", rows), turn], [taken], taken, axis=0))
-        # The turn is a scalar; in OpenCV it has an axis, which a reshape takes away.
-        if len(values) == 1:
-            target = self._constant(f"shape_{values[0][0].shape}", np.array(values[0][0].shape, np.int64))
-            inside[roll.stacked[0]] = f"{name}_of_turn"
-            return [*nodes, helper.make_node("Reshape", [taken, target], [f"{name}_of_turn"], f"{name}_of_turn")]
-        flat = self._constant("shape_flat", np.array([-1], np.int64))
-        nodes.append(helper.make_node("Reshape", [taken, flat], [row], row))
-        for number, (constants, (first, *_)) in enumerate(zip(roll.stacked, values)):
-            inside[constants] = f"{name}_of_turn_{number}"
-            splits.append(inside[constants] if first.ndim == 1 else f"{inside[constants]}_flat")
-            widths.append(first.size)
-            if first.ndim != 1:
-                shape = self._constant(f"shape_{first.shape}", np.array(first.shape, np.int64))
-                nodes.append(helper.make_node("Reshape", [splits[-1], shape], [inside[constants]], inside[constants]))
-        sizes = self._constant(f"{name}_widths", np.array(widths, np.int64))
-        nodes.insert(2, helper.make_node("Split", [row, sizes], splits, f"{name}_split", axis=0))
-        return nodes
+        rows = np.concatenate([stack.reshape(roll.count, -1) for stack in stacks.values()], 1)
+        for number, stack in enumerate(stacks.values()):
+            value = f"{name}_of_turn_{number}"
+            splits.append(value if stack.ndim == 2 else f"{value}_flat")
+            if stack.ndim != 2:
+                nodes.append(self._reshaped(splits[-1], stack.shape[1:], value))
+        sizes = self._constant(f"{name}_widths", np.array([stack[0].size for stack in stacks.values()], np.int64))
+        split = helper.make_node("Split", [row, sizes], splits, f"{name}_split", axis=0)
+        return [self._taken(rows, turn, taken), self._reshaped(taken, (-1,), row), split, *nodes]
+
+    def _taken(self, stack: Array, turn: str, output: str) -> Any:
+        """The node that takes what belongs to a turn out of what belongs to all."""
+        return helper.make_node("Gather", [self._constant(f"{output}_of_all", stack), turn], [output], output, axis=0)
+
+    def _reshaped(self, source: str, shape: tuple[int, ...], output: str) -> Any:
+        """A reshape. What was taken needs one: the turn is a scalar, but in OpenCV it has an axis."""
+        target = self._constant(f"shape_{shape}", np.array(shape, np.int64))
+        return helper.make_node("Reshape", [source, target], [output], output)
 
     def _constant(self, name: str, value: Array) -> str:
         if name not in self._constants:

@@ -134,10 +134,11 @@ def join_sums(graph: TrialGraph) -> None:
 
 
 def search_in_blocks(graph: TrialGraph) -> None:
-    """The largest entries of a product's rows, a block of rows at a time: N x N entries at once are too many.
+    """The largest entries of a product's rows, a block of rows and a window of columns around it at a time.
 
-    What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, whose indices are
-    appended to those of the blocks before. Every row sees the same numbers, so the indices stay the same.
+    What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, whose indices lie
+    side by side in the end. Up to :data:`WINDOW` columns a row sees the same numbers as before, and all indices stay
+    the same; of more it sees as many, and neither time nor memory grow with N².
     """
     readers = Counter(name for node in graph.nodes for name in node.input)
     makers = {node.output[0]: node for node in graph.nodes}
@@ -148,51 +149,62 @@ def search_in_blocks(graph: TrialGraph) -> None:
             kept.append(node)
         else:
             blocked.add(node.input[0])
-            kept += _block_search(graph, product, node)
+            kept += _block_search(graph, product, node, makers.get(product.input[0]))
     graph.nodes = [node for node in kept if node.output[0] not in blocked]
 
 
-def _block_search(graph: TrialGraph, product: Any, largest: Any) -> list[Any]:
-    """The nodes in the place of a product and of the largest entries of its rows."""
+def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any) -> list[Any]:
+    """The nodes in the place of a product, whose rows ``maker`` made, and of the largest entries of its rows."""
     name, (_, indices) = largest.name, largest.output
     rows, columns = product.input
-    *outer, _, k = shape = graph.shape(indices)
-    axis = graph.constant(f"axis_{len(shape) - 2}_rows", np.array([len(shape) - 2], np.int64))
-    block = graph.constant("block", np.array([BLOCK], np.int64))
-    count = graph.size("N")
-    above = graph.in_front("Add", [count, graph.constant("block_less_one", np.array([BLOCK - 1], np.int64))], "N_above")
-    turns = graph.in_front("Squeeze", [graph.in_front("Div", [above, block], "blocks")], "blocks_scalar")
-    zero = [graph.size(size) for size in (*outer, 0, k)]
-    key = "_".join(map(str, [*outer, k]))
-    shape_of_none = graph.in_front("Concat", zero, f"shape_of_none_{key}", axis=0)
-    nothing = numpy_helper.from_array(np.zeros(1, np.int64))
-    none = f"{name}_none"
-    turn, on, before, after = (f"{name}_{part}" for part in ("turn", "on", "before", "after"))
-    start, end, part, nearness = (f"{name}_{item}" for item in ("start", "end", "part", "nearness"))
+    *outer, _, k = graph.shape(indices)
+    axis = len(outer)
+    row_axis, block = graph.constant(f"axis_{axis}", np.array([axis], np.int64)), graph.size(BLOCK)
+    count = graph.in_front("Squeeze", [graph.size("N")], "N_scalar")
+    above = graph.in_front("Add", [count, graph.constant("more", np.array(BLOCK - 1, np.int64))], "N_above")
+    turns = graph.in_front("Div", [above, graph.constant("block_scalar", np.array(BLOCK, np.int64))], "blocks")
+    filled, parts, joined, flat = (f"{name}_{part}" for part in ("filled", "parts", "joined", "flat"))
+    turn, on, stays = (f"{name}_{part}" for part in ("turn", "on", "stays"))
+    start, end, part, nearness, found = (f"{name}_{item}" for item in ("start", "end", "part", "nearness", "found"))
     body = helper.make_graph(
         [
             helper.make_node("Mul", [turn, block], [start], start),
             helper.make_node("Add", [start, block], [end], end),
-            helper.make_node("Slice", [rows, start, end, axis], [part], part),
+            helper.make_node("Slice", [filled, start, end, row_axis], [part], part),
             helper.make_node("MatMul", [part, columns], [nearness], product.name),
-            _renamed(largest, [nearness, largest.input[1]], [f"{name}_values", f"{name}_indices"]),
-            helper.make_node("Concat", [before, f"{name}_indices"], [after], after, axis=len(shape) - 2),
+            _renamed(largest, [nearness, largest.input[1]], [f"{name}_values", found]),
+            helper.make_node("Identity", [on], [stays], stays),  # OpenVINO wants an output of its own
         ],
         f"{name}_block",
         [
             helper.make_tensor_value_info(turn, onnx.TensorProto.INT64, []),
             helper.make_tensor_value_info(on, onnx.TensorProto.BOOL, []),
-            helper.make_tensor_value_info(before, onnx.TensorProto.INT64, [*outer, None, k]),
         ],
         [
-            helper.make_tensor_value_info(on, onnx.TensorProto.BOOL, []),
-            helper.make_tensor_value_info(after, onnx.TensorProto.INT64, [*outer, None, k]),
+            helper.make_tensor_value_info(stays, onnx.TensorProto.BOOL, []),
+            helper.make_tensor_value_info(found, onnx.TensorProto.INT64, [*outer, BLOCK, k]),
         ],
     )
+    target = graph.constant(f"{name}_target", np.array([*[0] * axis, -1, k], np.int64))
     return [
-        helper.make_node("ConstantOfShape", [shape_of_none], [none], none, value=nothing),
-        helper.make_node("Loop", [turns, "", none], [indices], f"{name}_blocks", body=body),
+        *_filled(graph, rows, filled, axis, maker),
+        helper.make_node("Loop", [turns, ""], [parts], f"{name}_blocks", body=body),
+        helper.make_node("Transpose", [parts], [joined], joined, perm=[*range(1, axis + 1), 0, axis + 1, axis + 2]),
+        helper.make_node("Reshape", [joined, target], [flat], flat),
+        helper.make_node("Slice", [flat, graph.size(0), graph.size("N"), row_axis], [indices], f"{name}_all"),
     ]
+
+
+def _filled(graph: TrialGraph, rows: str, filled: str, axis: int, maker: Any) -> list[Any]:
+    """The node that makes whole blocks of rows: a ``Pad``, in the place of the one that made the rows, if any."""
+    more = np.zeros((2, axis + 2), np.int64)
+    more[1, axis] = BLOCK - 1
+    value: list[str] = []
+    if maker is not None and maker.op_type == "Pad" and maker.input[1] in graph.trials[0]:
+        more += graph.trials[0][maker.input[1]].reshape(2, -1)
+        rows, value = maker.input[0], list(maker.input[2:])
+    pads = graph.constant(f"{filled}_pads", more.ravel())
+    return [helper.make_node("Pad", [rows, pads, *value], [filled], filled)]
 
 
 def _renamed(node: Any, inputs: list[str], outputs: list[str]) -> Any:
@@ -245,6 +257,7 @@ def _merge(graph: Any, names: Mapping[str, str]) -> None:
 def share_sizes(graph: TrialGraph) -> None:
     """Reshape by constants where at most one size is free; make other shapes of the input's B and N."""
     fixed, sized = {*graph.constants, ""}, set[str]()
+    reshaped: dict[str, str] = {}  # what a reshape gives, and what it or the reshapes in front of it took
     kept = []
     for node in graph.nodes:
         output = node.output[0]
@@ -253,10 +266,15 @@ def share_sizes(graph: TrialGraph) -> None:
         elif not node.input:
             fixed.update(node.output)
         if node.op_type in ("Reshape", "Flatten"):
-            target = _reshape_target(graph.shape(node.input[0]), graph.shape(output))
-            if target.count(-1) <= 1:
-                inputs = [node.input[0], graph.constant(f"{output}_target", np.array(target, np.int64))]
+            source = reshaped.get(node.input[0], node.input[0])
+            before, after = graph.shape(source), graph.shape(output)
+            target = _reshape_target(before, after)
+            if before == after and None not in before:
+                node = helper.make_node("Identity", [source], [output], node.name)
+            elif target.count(-1) <= 1:
+                inputs = [source, graph.constant(f"{output}_target", np.array(target, np.int64))]
                 node = helper.make_node("Reshape", inputs, [output], node.name)
+                reshaped[output] = source
         elif output in sized and _holds_sizes(graph, output):
             parts = [graph.size(size) for size in graph.sizes_in(output)]
             if graph.trials[0][output].ndim:

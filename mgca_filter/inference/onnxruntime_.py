@@ -29,8 +29,8 @@ _FULL_PRECISION = {
     "CUDAExecutionProvider": {"use_tf32": "0"},
     "TensorrtExecutionProvider": {"trt_fp16_enable": "0"},
 }
-# As a provider OpenVINO ends the process while it reads the network's loops (ONNX Runtime 1.24); by itself it refuses
-# them (2026.0 to 2026.4) or answers wrongly (2024.6, 2025.4).
+# As a provider (ONNX Runtime 1.24) OpenVINO does not find what the network's loops take from outside them; by itself it
+# does: docs/how_to/runtimes.md.
 _REFUSED = ("OpenVINOExecutionProvider",)
 PROVIDERS_VARIABLE = "MGCA_FILTER_PROVIDERS"
 THREADS_VARIABLE = "MGCA_FILTER_NUM_THREADS"

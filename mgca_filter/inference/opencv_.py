@@ -13,10 +13,6 @@ from .backend import INPUT_NAMES, OUTPUT_NAMES, Float32Array, ProcessLock, check
 from .model_file import ModelFile, ModelMetadata
 
 MINIMUM_OPENCV = 5
-# OpenCV 5.0 lays out the body of a Loop anew only where the shape of the network's input is another than in the pass
-# before. The neighbours are searched in blocks of matches, of which the last is shorter: a second pass of one shape
-# would begin with the buffers of that block, and its logits would be wrong by several units.
-_OTHER_SHAPE = (1, 1)
 
 
 class OpenCvBackend:
@@ -46,7 +42,6 @@ class OpenCvBackend:
                 "or use backend='onnxruntime'"
             )
         self._lock = ProcessLock()  # setInput and forward belong together
-        self._shape: tuple[int, ...] | None = None  # batch and matches of the pass before
         try:
             # From the path: the overload that reads a buffer does not heed the engine.
             self._net: Any = cv2.dnn.readNetFromONNX(str(path), engine=cv2.dnn.ENGINE_NEW)
@@ -63,22 +58,13 @@ class OpenCvBackend:
         check_input(correspondences, attributes)
         try:
             with self._lock:
-                shape = correspondences.shape[:2]
-                if shape == self._shape != _OTHER_SHAPE:
-                    self._forward(
-                        *(np.zeros((*_OTHER_SHAPE, x.shape[2]), x.dtype) for x in (correspondences, attributes))
-                    )
-                self._shape = shape
-                logits, essential = self._forward(correspondences, attributes)
+                for name, value in zip(INPUT_NAMES, (correspondences, attributes)):
+                    self._net.setInput(np.ascontiguousarray(value), name)
+                # The network reuses its buffers in the next pass.
+                logits, essential = (np.array(output, dtype=np.float32) for output in self._net.forward(OUTPUT_NAMES))
         except cv2.error as error:
             raise BackendError(f"OpenCV's DNN module failed on {self._path} ({error})") from error
         return logits, essential
-
-    def _forward(self, correspondences: Float32Array, attributes: Float32Array) -> list[Float32Array]:
-        for name, value in zip(INPUT_NAMES, (correspondences, attributes)):
-            self._net.setInput(np.ascontiguousarray(value), name)
-        # The network reuses its buffers in the next pass.
-        return [np.array(output, dtype=np.float32) for output in self._net.forward(OUTPUT_NAMES)]
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self._path}

@@ -72,7 +72,7 @@ def smallest_eigenvector(A: Tensor) -> Tensor:
     """Unit eigenvectors (B, n) of the smallest eigenvalues of symmetric positive semi-definite A (B, n, n).
 
     tr(A) I − A has the same eigenvectors in reversed order; squaring it 20 times leaves the outer product of
-    the wanted one with itself, of which the column with the largest diagonal entry is taken. No LAPACK.
+    the wanted one with itself, of which the row with the largest entry is taken. No LAPACK.
     """
     v = smallest_eigenvector_row(A)[:, 0]
     return v / v.norm(dim=-1, keepdim=True)
@@ -86,7 +86,7 @@ def smallest_eigenvector_row(A: Tensor) -> Tensor:
         M = M @ M
         if step % SQUARINGS_PER_NORMALISATION == 0:
             M = M / M.amax((1, 2), keepdim=True)  # on the diagonal
-    largest = (M * eye).sum(-1).argmax(-1, keepdim=True)
+    largest = M.amax(2).argmax(-1, keepdim=True)  # its largest entry is on the diagonal
     return F.embedding(largest, eye) @ M
 
 
@@ -112,11 +112,11 @@ def weighted_eight_point(correspondences: Tensor, weights: Tensor) -> Tensor:
     spread = (row @ centred.square()) @ constant(_PER_IMAGE, centred)
     scale = torch.rsqrt(spread + 1e-8)  # (B, 1, 4), two equal ones of each image
     phi = homogeneous_products(centred * scale)  # (B, N, 9)
-    E = smallest_eigenvector_row((phi.transpose(1, 2) * row) @ phi).view(-1, 3, 3)
+    E = smallest_eigenvector_row((phi.transpose(1, 2) * row) @ phi).view(-1, 1, 3, 3)
     transforms = torch.cat([scale, scale * centre], -1) @ constant(_CONDITIONING, E) + constant(_CONDITIONING_OFFSET, E)
-    transforms = transforms.view(-1, 2, 3, 3)
+    image1, image2 = transforms.view(-1, 2, 3, 3).split(1, 1)
     # Divided as a vector: else OpenCV, which forgets the shape of what it reshaped, warns of every answer.
-    vector = (transforms[:, 1] @ E @ transforms[:, 0]).reshape(-1, 1, 9)
+    vector = (image2 @ E @ image1).reshape(-1, 1, 9)
     return (vector / vector.norm(dim=2, keepdim=True)).view(-1, 3, 3)
 
 
