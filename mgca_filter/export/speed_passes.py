@@ -15,6 +15,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
+from .compact_network import WINDOW
 from .rolled_loops import roll_loops
 from .trial_graph import Size, TrialGraph, all_inputs, bodies, signature
 
@@ -22,8 +23,10 @@ BLOCK = 256  # rows of a neighbour search at once: 32 MB with four graphs of 800
 _MAX_SIZES = 8  # elements of what may be the shape of a tensor
 
 
-def simplify(model: onnx.ModelProto) -> onnx.ModelProto:
+def simplify(model: onnx.ModelProto, windows: bool = False) -> onnx.ModelProto:
     """Simplify a traced model whose first input is (B, N, ...); inputs, outputs and metadata stay.
+
+    ``windows`` says that neighbours lie near each other where they are looked for.
 
     1. sizes are taken from the input's shape once
     2. means become products, and sums escape slow fusions of ONNX Runtime
@@ -35,7 +38,7 @@ def simplify(model: onnx.ModelProto) -> onnx.ModelProto:
     share_sizes(graph)
     turn_means_into_products(graph)
     keep_sums_from_fusion(graph)
-    search_in_blocks(graph)
+    search_in_blocks(graph, windows)
     graph = TrialGraph(graph.model())
     compute_constants(graph)
     concatenate_transposed(graph)
@@ -133,12 +136,12 @@ def join_sums(graph: TrialGraph) -> None:
     graph.nodes = [node for node in graph.nodes if node.output[0] not in joined]
 
 
-def search_in_blocks(graph: TrialGraph) -> None:
-    """The largest entries of a product's rows, a block of rows and a window of columns around it at a time.
+def search_in_blocks(graph: TrialGraph, windows: bool = False) -> None:
+    """The largest entries of a product's rows, a block of rows at a time: N x N entries at once are too many.
 
-    What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, whose indices lie
-    side by side in the end. Up to :data:`WINDOW` columns a row sees the same numbers as before, and all indices stay
-    the same; of more it sees as many, and neither time nor memory grow with N².
+    What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, each of which
+    gives indices of the same shape. Every row sees the same numbers, so the indices stay the same. In ``windows`` a
+    block sees :data:`WINDOW` columns around it alone, or all where there are no more: the time, too, grows with N then.
     """
     readers = Counter(name for node in graph.nodes for name in node.input)
     makers = {node.output[0]: node for node in graph.nodes}
@@ -149,11 +152,11 @@ def search_in_blocks(graph: TrialGraph) -> None:
             kept.append(node)
         else:
             blocked.add(node.input[0])
-            kept += _block_search(graph, product, node, makers.get(product.input[0]))
+            kept += _block_search(graph, product, node, makers.get(product.input[0]), windows)
     graph.nodes = [node for node in kept if node.output[0] not in blocked]
 
 
-def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any) -> list[Any]:
+def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any, windows: bool) -> list[Any]:
     """The nodes in the place of a product, whose rows ``maker`` made, and of the largest entries of its rows."""
     name, (_, indices) = largest.name, largest.output
     rows, columns = product.input
@@ -166,15 +169,18 @@ def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any) -> 
     filled, parts, joined, flat = (f"{name}_{part}" for part in ("filled", "parts", "joined", "flat"))
     turn, on, stays = (f"{name}_{part}" for part in ("turn", "on", "stays"))
     start, end, part, nearness, found = (f"{name}_{item}" for item in ("start", "end", "part", "nearness", "found"))
+    nodes = [
+        helper.make_node("Mul", [turn, block], [start], start),
+        helper.make_node("Add", [start, block], [end], end),
+        helper.make_node("Slice", [filled, start, end, row_axis], [part], part),
+        helper.make_node("MatMul", [part, columns], [nearness], product.name),
+        _renamed(largest, [nearness, largest.input[1]], [f"{name}_values", found]),
+        helper.make_node("Identity", [on], [stays], stays),  # OpenVINO wants an output of its own
+    ]
+    if windows:
+        _see_a_window(graph, nodes, start, axis + 1)
     body = helper.make_graph(
-        [
-            helper.make_node("Mul", [turn, block], [start], start),
-            helper.make_node("Add", [start, block], [end], end),
-            helper.make_node("Slice", [filled, start, end, row_axis], [part], part),
-            helper.make_node("MatMul", [part, columns], [nearness], product.name),
-            _renamed(largest, [nearness, largest.input[1]], [f"{name}_values", found]),
-            helper.make_node("Identity", [on], [stays], stays),  # OpenVINO wants an output of its own
-        ],
+        nodes,
         f"{name}_block",
         [
             helper.make_tensor_value_info(turn, onnx.TensorProto.INT64, []),
@@ -193,6 +199,27 @@ def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any) -> 
         helper.make_node("Reshape", [joined, target], [flat], flat),
         helper.make_node("Slice", [flat, graph.size(0), graph.size("N"), row_axis], [indices], f"{name}_all"),
     ]
+
+
+def _see_a_window(graph: TrialGraph, nodes: list[Any], start: str, axis: int) -> None:
+    """Let a block of rows from ``start`` on see a window of the columns, which are the last ``axis``."""
+    *_, product, largest, _ = nodes
+    found, count, zero, window = largest.output[1], graph.size("N"), graph.size(0), graph.size(WINDOW)
+    beyond = graph.in_front("Sub", [count, window], "N_beyond_window")
+    last = graph.in_front("Max", [beyond, zero], "last_window")
+    before, inside, first, end, seen, here = (
+        f"{found}_{part}" for part in ("before", "inside", "first", "end", "seen", "here")
+    )
+    column_axis = graph.constant(f"axis_{axis}", np.array([axis], np.int64))
+    columns, product.input[1], largest.output[1] = product.input[1], seen, here
+    nodes[nodes.index(product) : nodes.index(product)] = [
+        helper.make_node("Sub", [start, graph.size((WINDOW - BLOCK) // 2)], [before], before),
+        helper.make_node("Max", [before, zero], [inside], inside),
+        helper.make_node("Min", [inside, last], [first], first),
+        helper.make_node("Add", [first, window], [end], end),
+        helper.make_node("Slice", [columns, first, end, column_axis], [seen], seen),
+    ]
+    nodes.append(helper.make_node("Add", [here, first], [found], found))
 
 
 def _filled(graph: TrialGraph, rows: str, filled: str, axis: int, maker: Any) -> list[Any]:

@@ -9,7 +9,8 @@ import torch
 from networks import TINY, randomise_norms, settled_network, tiny_network, two_view_batch
 from torch import nn
 
-from mgca_filter.export.compact_network import compact, nearest_rows
+from mgca_filter.export import compact_network
+from mgca_filter.export.compact_network import compact, nearest_rows, nearest_rows_in_order
 from mgca_filter.network.attention import ContextGraphAttention
 from mgca_filter.network.consensus import GraphConsensus
 from mgca_filter.network.graph import GraphBlock, nearest_neighbours
@@ -78,6 +79,14 @@ def test_rows_of_neighbours_are_those_of_the_network(count: int) -> None:
     for number, x in enumerate(spaces.flatten(0, 1)):
         expected = nearest_neighbours(x[None], 4)[0] + number * count
         torch.testing.assert_close(rows.flatten(0, 1)[number], expected)
+
+
+@pytest.mark.parametrize("count", [1, 5, 40, 300])
+@pytest.mark.parametrize("window", [16, 2048])
+def test_an_order_in_which_neighbours_lie_together_does_not_change_them(monkeypatch, count: int, window: int) -> None:
+    monkeypatch.setattr(compact_network, "WINDOW", window)
+    spaces = features(2, 3, count, 5)
+    torch.testing.assert_close(nearest_rows_in_order(spaces, 4), nearest_rows(spaces, 4))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import mgca_filter
-from mgca_filter.export import parity
+from mgca_filter.export import parity, speed_passes, trial_graph
 from mgca_filter.export.onnx_export import export_onnx
 from mgca_filter.export.speed_passes import BLOCK, simplify
 from mgca_filter.export.trial_graph import bodies, count_nodes
@@ -213,6 +213,32 @@ def test_neighbours_are_searched_in_blocks(count: int) -> None:
     assert [item.name for item in body.output][0] not in [item.name for item in body.input]
     x = np.random.default_rng(2).normal(size=(2, count, WIDTH)).astype(np.float32)
     np.testing.assert_array_equal(run(simplified, x), run(model, x))
+
+
+@pytest.mark.parametrize("count", [1, 299, 300, 301, 700, 3 * BLOCK])
+def test_a_block_sees_the_window_around_it(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    window, k = 300, 2
+    monkeypatch.setattr(speed_passes, "WINDOW", window)
+    nodes = [
+        node("Transpose", ["x"], "t", perm=[0, 2, 1]),
+        node("Concat", ["t", "far"], "columns", axis=2),  # a search gives k indices of a single match as well
+        node("MatMul", ["x", "columns"], "nearness"),
+        helper.make_node("TopK", ["nearness", "k"], ["values", "indices"], "search"),
+        node("Cast", ["indices"], "y", to=TensorProto.FLOAT),
+    ]
+    constants = {"k": np.array([k], np.int64), "far": np.zeros((1, WIDTH, k), np.float32)}
+    model = build(nodes, constants)
+    # The trial runs take more than one pair; constants of this test do not.
+    monkeypatch.setattr(trial_graph, "TRIAL_SIZES", ((1, 7), (1, 97), (1, 151)))
+    simplified = simplify(model, windows=True)
+    x = np.random.default_rng(2).normal(size=(1, count, WIDTH)).astype(np.float32)
+    columns = np.concatenate([x[0].T, constants["far"][0]], 1)
+    expected = []
+    for first in range(0, count, BLOCK):
+        start = max(0, min(first - (window - BLOCK) // 2, count - window))
+        nearness = x[0, first : first + BLOCK] @ columns[:, start : start + window]
+        expected.append(np.argsort(-nearness, axis=1, kind="stable")[:, :k] + start)
+    np.testing.assert_array_equal(run(simplified, x)[0], np.concatenate(expected))
 
 
 def test_the_shipped_graph_is_small() -> None:
