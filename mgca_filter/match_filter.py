@@ -180,8 +180,21 @@ class MatchFilter:
                 self._weigh(job, backend, last=number == len(self._backends))
         return [self._finish(job) for job in jobs]
 
-    def _start(self, pair: MatchPair | tuple[Any, Any, Any], index: int) -> _Job:
-        """Steps 1 and 2: read the pair; choose what enters the first network, if any."""
+    @np.errstate(all="ignore")
+    def filter_list(self, pair: MatchPair | tuple[Any, Any, Any]) -> FilterResult | None:
+        """Filter a pair whose matches explain themselves; None where a network is wanted, or was asked for.
+
+        With intrinsics the answer is that of :meth:`filter_many`. Without, its mask is as good, where two fits of the
+        fundamental matrix agree, but there is no pose, and F is less exact: for those who want matches in little time.
+
+        Raises:
+            As :func:`filter_matches`.
+        """
+        job = self._start(pair, 0, list_alone=True)
+        return None if job.model is None else self._finish(job)
+
+    def _start(self, pair: MatchPair | tuple[Any, Any, Any], index: int, list_alone: bool = False) -> _Job:
+        """Steps 1 and 2: read the pair; choose what enters the first network, if any, unless there shall be none."""
         started = time.perf_counter()
         if isinstance(pair, tuple) and len(pair) == 3:
             pair = MatchPair(*pair)
@@ -202,8 +215,10 @@ class MatchFilter:
                 job.search = Search(job.evidence, self.metadata.choice, self.options)
                 if self.options.method == "auto" and self.options.effort == "auto":
                     job.model = job.search.before_network()
+                    if list_alone and not prepared.calibrated:
+                        job.model = job.search.agreed_fundamental()
             job.timings_ms["fit"] = _milliseconds_since(started)
-        if job.model is None:
+        if job.model is None and not list_alone:
             job.sent = select_network_input(
                 prepared.correspondences, prepared.attributes, prepared.valid, self._backends[0], self.options.seed
             )

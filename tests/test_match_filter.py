@@ -495,6 +495,27 @@ def test_without_intrinsics_every_list_is(match_filter: MatchFilter, asked: list
     assert result.confidence > 0.5
 
 
+def test_a_list_that_explains_itself_is_filtered_by_itself(match_filter: MatchFilter, asked: list[int]) -> None:
+    def pair(scene: Scene, intrinsics: np.ndarray | None) -> MatchPair:
+        return MatchPair(scene.points1, scene.points2, None, K1=intrinsics, attributes=scene.attributes)
+
+    assert_same(match_filter.filter_list(pair(EASY, K)), ask(match_filter, EASY))
+    bare = match_filter.filter_list(pair(EASY, None))
+    assert (bare.status, bare.R, bare.t, bare.E, bare.confidence) == (Status.OK, None, None, None, None)
+    assert (bare.info["ended"], bare.info["intrinsics"]) == ("before the network", "guessed")
+    assert bare.mask[EASY.inlier].mean() > 0.97
+    assert bare.mask[~EASY.inlier].mean() < 0.1
+    assert bare.scores[EASY.inlier].min() > bare.scores[~EASY.inlier].mean()
+    error = sampson_distance(np.hstack([EASY.points1, EASY.points2])[EASY.inlier], bare.F)
+    assert np.median(error) < 0.5
+    assert match_filter.filter_list(pair(make_scene("planar", right=200, wrong=0), None)).status is Status.PLANAR
+    assert match_filter.filter_list(pair(HARD, K)) is match_filter.filter_list(pair(HARD, None)) is None
+    for options in ({"effort": "full"}, {"method": "magsac"}, {"method": "none"}, {"geometry": "homography"}):
+        chosen = MatchFilter.over(*match_filter._backends, options=replace(match_filter.options, **options))
+        assert chosen.filter_list(pair(EASY, K)) is None
+    assert asked == []
+
+
 def test_in_a_batch_only_the_hard_ones_are(match_filter: MatchFilter, asked: list[int]) -> None:
     pairs = [MatchPair(s.points1, s.points2, None, K1=K, attributes=s.attributes) for s in (EASY, HARD, EASY, HARD)]
     results = match_filter.filter_many(pairs)

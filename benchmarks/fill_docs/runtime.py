@@ -23,6 +23,10 @@ COMMANDS = {
     "lists_fast": ("-m", "benchmarks.speed", "--per-scene", "1", "--model", "fast"),
     "opening": ("-m", "benchmarks.opening"),
     "scaling": ("-m", "benchmarks.profile_network", "--scaling", "--threads", "1"),
+    "scaling_fast": (
+        *("-m", "benchmarks.profile_network", "mgca_filter/models/mgca_fast.onnx"),
+        *("--scaling", "--threads", "1"),
+    ),
     "profile_500": ("-m", "benchmarks.profile_network", "--count", "500", "--threads", "1"),
     "profile_2000": ("-m", "benchmarks.profile_network", "--count", "2000", "--threads", "1"),
     "parity": ("export/parity.py",),

@@ -44,6 +44,9 @@ LARGEST_PARALLAX_MEDIANS = 25.0
 SAME_DEG, TWIN_DEG = 0.3, 2.0
 # The early end is given up where a run explains less than the first share of the list; above the second, one will do.
 PROMISING, CERTAIN = 0.3, 0.7
+# Without intrinsics two runs must agree: on this share of the matches within so many pixels of one or the other, on
+# more than so many of these, and on the direction of the epipolar lines, which lenses that nobody has calibrated bend.
+AGREED_PX, AGREED_SHARE, AGREED_LEAST, AGREED_DEG = 2.0, 0.95, 15, 2.0
 # A twin that explains less than this share of what the best pose does within so many pixels, before it is refined, is
 # no alternative.
 TWIN_SHARE, TWIN_PX = 0.5, 2.0
@@ -389,6 +392,33 @@ class Search:
             return model
         return replace(model, expected=found)
 
+    def agreed_fundamental(self) -> TwoViewModel | None:
+        """The fundamental matrix of a list that explains itself; None where the network is wanted.
+
+        Two runs agree on most of the matches and on the way that the epipolar lines take through them. It tells right
+        matches apart as well as :meth:`with_network` does; a pose that is taken from it is less exact, for no score
+        tells which of the few others to leave alone.
+        """
+        if len(self._evidence) < MIN_MATCHES:
+            return None
+        found = list[tuple[Array, str]]()
+        distance = np.zeros((0, len(self._judged)))
+        for proposal in self._plan.before:
+            new = [(F, proposal.name) for F in self._run(proposal)]
+            residuals = [sampson_distance(self._judged, F) * self._evidence.focal_px for F, _ in new]
+            found, distance = found + new, np.vstack([distance, *residuals])
+            least = max(CERTAIN * len(self._judged), AGREED_LEAST)
+            if not new or np.count_nonzero(residuals[0] < AGREED_PX) <= least:
+                return None
+        near = distance < AGREED_PX
+        both = near.all(axis=0)
+        if np.count_nonzero(both) < AGREED_SHARE * np.count_nonzero(near.any(axis=0)):
+            return None
+        if epipolar_angle_deg(self._judged[both], found[0][0], found[1][0]) > AGREED_DEG:
+            return None
+        found += [(F, SECOND[1].name) for F in self._run(SECOND[1])]
+        return self._likeliest(found, np.ones(len(self._judged)), "before the network")
+
     def _fundamental(self) -> TwoViewModel | None:
         """The fundamental matrix of a pair without intrinsics, and the pose that the guessed ones make of it.
 
@@ -399,10 +429,12 @@ class Search:
         if method == "poselib":
             wanted = (*wanted, POSELIB)
         found = [(F, proposal.name) for proposal in wanted for F in self._run(proposal)]
-        if not found:
-            return None
+        return self._likeliest(found, np.asarray(evidence.scores)[evidence.once], "all sources") if found else None
+
+    def _likeliest(self, found: Sequence[tuple[Array, str]], scores: Array, ended: str) -> TwoViewModel | None:
+        """The model of the likeliest of fundamental matrices, by its matches' scores (N,)."""
+        evidence = self._evidence
         distance = np.stack([sampson_distance(self._judged, F) for F, _ in found]) * evidence.focal_px
-        scores = np.asarray(evidence.scores)[evidence.once]
         probability = choice.prior(scores, self._coefficients)
         counts = choice.independent_counts(self._judged, scores, self._coefficients)
         residuals = Residuals(distance, np.zeros(distance.shape, dtype=bool))
@@ -410,14 +442,30 @@ class Search:
         F, origin = found[int(np.argmax(likelihood[:, int(np.argmax(likelihood.max(axis=0)))]))]
         E = project_to_essential(F)
         pose = pose_from_essential(F, evidence.correspondences, evidence.focal_px)
-        return None if pose is None else TwoViewModel(F, E, *pose, origin, "all sources")
+        return None if pose is None else TwoViewModel(F, E, *pose, origin, ended)
+
+
+def epipolar_angle_deg(matches: Array, F1: Array, F2: Array) -> float:
+    """Median angle, degrees, between the epipolar lines that two fundamental matrices (3, 3) give matches (N, 4)."""
+    angles = []
+    for points, A, B in ((matches[:, :2], F1, F2), (matches[:, 2:], F1.T, F2.T)):
+        normals1, normals2 = (points @ F[:2, :2].T + F[:2, 2] for F in (A, B))
+        cosine = np.abs((normals1 * normals2).sum(axis=1))
+        cosine /= np.maximum(np.linalg.norm(normals1, axis=1) * np.linalg.norm(normals2, axis=1), 1e-300)
+        angles.append(np.median(np.degrees(np.arccos(np.minimum(cosine, 1.0)))))
+    return float(max(angles))
 
 
 def scores_by_residuals(pair: PairInput, model: TwoViewModel, coefficients: Coefficients) -> NDArray[np.float32]:
     """Scores (M,) of a pair that ended before the network, from the residuals of its matches to the model."""
     valid, listed = pair.valid, listed_rows(pair.attributes, pair.valid)
     scores = np.zeros(len(valid), dtype=np.float32)
-    residuals = choice.measure_residuals(pair.correspondences[valid], model.R[None], model.t[None], pair.focal_px)
+    matches = pair.correspondences[valid]
+    if pair.calibrated:
+        residuals = choice.measure_residuals(matches, model.R[None], model.t[None], pair.focal_px)
+    else:  # depths mean little
+        distance = sampson_distance(matches, model.M)[None] * pair.focal_px
+        residuals = Residuals(distance, np.zeros(distance.shape, dtype=bool))
     scale = 1.0 if model.judgement is None else model.judgement.scale
     groups = (listed[valid], ~listed[valid])
     scores[valid] = choice.posterior(residuals, groups, scale, coefficients)

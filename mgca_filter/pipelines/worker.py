@@ -27,7 +27,6 @@ from ..features import (
 )
 from ..geometry.orientation import UPRIGHT
 from ..images import decode_photo
-from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
 from ..result import EXPLAINED, FilterResult, Status
@@ -35,6 +34,9 @@ from ..result import EXPLAINED, FilterResult, Status
 FAILED = "failed"
 # Half of what COLMAP's own verification lets pass: nearly as many points, and the most accurate poses.
 MAPPING_THRESHOLD_PX = 2.0
+# Of a list that explains itself without intrinsics, as much as COLMAP's own verification lets pass: lenses bend the
+# epipolar lines, and on fewer matches its mapper may start from a pair that it had better not start from.
+UNCALIBRATED_FACTOR = 2.0
 
 
 @dataclass(frozen=True)
@@ -90,6 +92,8 @@ class PairWorker:
 
     def __init__(self, filter_options: dict[str, Any]) -> None:
         self._filter = MatchFilter(**filter_options)
+        threshold = UNCALIBRATED_FACTOR * self._filter.options.threshold
+        self._uncalibrated = MatchFilter(**{**filter_options, "threshold": threshold})
 
     def filter(
         self,
@@ -131,26 +135,33 @@ class PairWorker:
         if matches is None:
             candidates: Any = match_descriptors(descriptors_of(image1), descriptors_of(image2))
             pairs = np.array([(c[0].queryIdx, c[0].trainIdx) for c in candidates], dtype=np.intp).reshape(-1, 2)
-            known: MatchAttributes | None = keypoint_attributes(image1, image2, pairs[:, 0], pairs[:, 1])
         else:
             candidates, pairs = matches, np.asarray(matches)
-            known = _known_of(image1, image2, pairs)
+        there = _are_there(image1, image2, pairs)  # else it is for the filter to say what is wrong
         pair = MatchPair(
             image1.points,
             image2.points,
             candidates,
             size1=image1.image_size,
             size2=image2.image_size,
-            attributes=known,
+            attributes=keypoint_attributes(image1, image2, pairs[:, 0], pairs[:, 1]) if there else None,
             resolution=max(image1.resolution, image2.resolution),
         )
+        filtered = there and matches is not None and _one_to_one(pairs)
+
+        def answer(pair: MatchPair) -> FilterResult:
+            quick = self._filter if pair.K1 is not None else self._uncalibrated
+            result = quick.filter_list(pair) if filtered else None
+            if result is None and there and matches is not None:  # only the network asks what the descriptors tell
+                pair = replace(pair, attributes=attributes_of_matches(image1, image2, pairs))
+            return self._filter.filter_many([pair])[0] if result is None else result
+
         if image1.K is not None and image2.K is not None:
-            known_cameras = replace(pair, K1=image1.K, K2=image2.K, stretch1=image1.stretch, stretch2=image2.stretch)
-            (result,) = self._filter.filter_many([known_cameras])
+            result = answer(replace(pair, K1=image1.K, K2=image2.K, stretch1=image1.stretch, stretch2=image2.stretch))
             if result.status is not Status.SUSPICIOUS_INTRINSICS:
                 return result, pairs
         # Without intrinsics, or with such as the matches contradict, F tells the matches apart.
-        return self._filter.filter_many([pair])[0], pairs
+        return answer(pair), pairs
 
     def extract(
         self, name: str, encoded: bytes, detector: str, max_keypoints: int
@@ -218,9 +229,12 @@ def _failed(name1: str, name2: str, message: str) -> PairRow:
     return PairRow(name1, name2, FAILED, 0, np.zeros((0, 2), np.uint32), np.zeros(0, np.float32), message=message)
 
 
-def _known_of(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> MatchAttributes | None:
-    """What the features tell of given matches; None where these are not pairs of indices, for the filter to refuse."""
+def _are_there(image1: ImageFeatures, image2: ImageFeatures, pairs: NDArray[Any]) -> bool:
+    """Whether given matches are pairs (M, 2) of indices of the features, M of 1 or more."""
     counts = (len(image1), len(image2))
-    if pairs.ndim != 2 or len(pairs) == 0 or pairs.min() < 0 or (pairs.max(axis=0) >= counts).any():
-        return None
-    return attributes_of_matches(image1, image2, pairs)
+    return pairs.ndim == 2 and len(pairs) > 0 and pairs.min() >= 0 and bool((pairs.max(axis=0) < counts).all())
+
+
+def _one_to_one(pairs: NDArray[Any]) -> bool:
+    """Whether no keypoint stands in two of the matches (M, 2): somebody has filtered them."""
+    return all(len(np.unique(column)) == len(column) for column in pairs.T)
