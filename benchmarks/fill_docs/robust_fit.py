@@ -13,7 +13,16 @@ from .pages import fill_file, provenance
 from .runtime import ROOT, run
 
 PAGE = ROOT / "docs" / "robust_fit.md"
-PLACES = ("fit_ablation", "input_kinds")
+PLACES = ("fit_ablation", "input_kinds", "gaps")
+GAPS = ("1", "2", "3", "5", "10", "20")
+OF_GAPS = "By frames between the images"
+"""The table of ``input_kinds --gaps`` that the place of the gaps shows."""
+
+
+def section(text: str, title: str) -> str:
+    """What stands below a heading, up to the next one."""
+    _, _, below = text.partition(f"## {title}\n")
+    return below.partition("\n## ")[0].strip()
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -29,11 +38,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for place in PLACES:
         if place in printed:
             text = Path(printed[place]).read_text(encoding="utf-8").strip()
+        elif folders and place == "gaps":
+            kinds = ("--kinds", "raw", "cross", "cross-ratio", "learned")
+            text = run(("-m", "benchmarks.input_kinds", *folders, *kinds, "--gaps", *GAPS))
         elif folders:
             seen = folders[:1] if place == "fit_ablation" else folders
             text = run(("-m", f"benchmarks.{place}", *seen, *per_scene))
         else:
             continue
+        text = section(text, OF_GAPS) if place == "gaps" else text
         fill_file(PAGE, {place: f"{text.replace(chr(10) + '## ', chr(10) + '### ')}\n\n{provenance()}"})
 
 

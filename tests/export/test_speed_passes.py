@@ -269,3 +269,10 @@ def test_the_shipped_network_exports_as_small_and_says_the_same(tmp_path: Path) 
         for count in parity.COUNTS:
             row = parity.compare(backend, reference, count)
             assert row.passed, parity.format_parity([row])
+
+
+def test_the_fast_network_decides_on_many_matches_as_if_it_had_compared_all() -> None:
+    path = mgca_filter.model_path("fast")
+    row = parity.compare(open_backend(path, "onnxruntime"), open_backend(path, "torch"), 5000)
+    assert row.flipped <= row.matches // 1000
+    assert row.quantile_90 < parity.QUANTILE_TOLERANCE
