@@ -37,7 +37,8 @@ from ..network.point_cn import (
 )
 
 ROOT_HALF = 0.5**0.5
-WINDOW = 2048  # matches among which a neighbour is looked for; the networks were trained on 2000 at most
+# Up to so many matches each is compared with all; of more, with so many around it. The networks were trained on 2000.
+MANY, WINDOW = 2048, 1024
 
 
 @torch.no_grad()
@@ -397,15 +398,15 @@ def nearest_rows(features: Tensor, k: int) -> Tensor:
 def nearest_rows_in_order(features: Tensor, k: int) -> Tensor:
     """The same, looked for in an order in which nearest matches lie near each other, so that windows of it will do.
 
-    Of more than :data:`WINDOW` matches the order is that along the direction in which the features vary most, which one
-    step of the power method tells well enough: of the neighbours of 8000 real matches all but one in a hundred are in
-    the window. Up to :data:`WINDOW` matches stay where they are.
+    Of more than :data:`MANY` matches the order is that along the direction in which the features vary most, which one
+    step of the power method tells well enough: nearly all neighbours are in the window. Up to :data:`MANY` matches stay
+    where they are.
     """
     *outer, count, channels = features.shape
     x = features - features.mean(-2, keepdim=True)
     direction = x.transpose(-1, -2) @ (x @ torch.linspace(1.0, 2.0, channels).unsqueeze(-1))
     place = torch.arange(count)
-    along = torch.where(place[-1:] < WINDOW, -place.float(), (x @ direction)[..., 0])
+    along = torch.where(place[-1:] < MANY, -place.float(), (x @ direction)[..., 0])
     starts = _starts(outer, count)[..., 0]
     order = along.argsort(-1, descending=True) + starts
     nearest = order.flatten()[_rows_nearest(F.embedding(order, x.reshape(-1, channels)), k)]

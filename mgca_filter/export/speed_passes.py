@@ -15,7 +15,7 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from .compact_network import WINDOW
+from .compact_network import MANY, WINDOW
 from .rolled_loops import roll_loops
 from .trial_graph import Size, TrialGraph, all_inputs, bodies, signature
 
@@ -141,7 +141,7 @@ def search_in_blocks(graph: TrialGraph, windows: bool = False) -> None:
 
     What it does to ``MatMul`` → ``TopK`` where only the indices are read: a Loop over blocks of rows, each of which
     gives indices of the same shape. Every row sees the same numbers, so the indices stay the same. In ``windows`` a
-    block sees :data:`WINDOW` columns around it alone, or all where there are no more: the time, too, grows with N then.
+    block of more than :data:`MANY` rows sees :data:`WINDOW` columns around it alone: the time, too, grows with N then.
     """
     readers = Counter(name for node in graph.nodes for name in node.input)
     makers = {node.output[0]: node for node in graph.nodes}
@@ -204,16 +204,19 @@ def _block_search(graph: TrialGraph, product: Any, largest: Any, maker: Any, win
 def _see_a_window(graph: TrialGraph, nodes: list[Any], start: str, axis: int) -> None:
     """Let a block of rows from ``start`` on see a window of the columns, which are the last ``axis``."""
     *_, product, largest, _ = nodes
-    found, count, zero, window = largest.output[1], graph.size("N"), graph.size(0), graph.size(WINDOW)
-    beyond = graph.in_front("Sub", [count, window], "N_beyond_window")
-    last = graph.in_front("Max", [beyond, zero], "last_window")
+    found, count, zero = largest.output[1], graph.size("N"), graph.size(0)
+    many = graph.in_front("Greater", [count, graph.size(MANY)], "many")
+    window = graph.in_front("Where", [many, graph.size(WINDOW), graph.size(MANY)], "window")
+    last = graph.in_front("Max", [graph.in_front("Sub", [count, window], "N_beyond_window"), zero], "last_window")
+    around = graph.in_front("Sub", [window, graph.size(BLOCK)], "around_block")
+    margin = graph.in_front("Div", [around, graph.size(2)], "margin")
     before, inside, first, end, seen, here = (
         f"{found}_{part}" for part in ("before", "inside", "first", "end", "seen", "here")
     )
     column_axis = graph.constant(f"axis_{axis}", np.array([axis], np.int64))
     columns, product.input[1], largest.output[1] = product.input[1], seen, here
     nodes[nodes.index(product) : nodes.index(product)] = [
-        helper.make_node("Sub", [start, graph.size((WINDOW - BLOCK) // 2)], [before], before),
+        helper.make_node("Sub", [start, margin], [before], before),
         helper.make_node("Max", [before, zero], [inside], inside),
         helper.make_node("Min", [inside, last], [first], first),
         helper.make_node("Add", [first, window], [end], end),

@@ -84,7 +84,7 @@ def test_rows_of_neighbours_are_those_of_the_network(count: int) -> None:
 @pytest.mark.parametrize("count", [1, 5, 40, 300])
 @pytest.mark.parametrize("window", [16, 2048])
 def test_an_order_in_which_neighbours_lie_together_does_not_change_them(monkeypatch, count: int, window: int) -> None:
-    monkeypatch.setattr(compact_network, "WINDOW", window)
+    monkeypatch.setattr(compact_network, "MANY", window)
     spaces = features(2, 3, count, 5)
     torch.testing.assert_close(nearest_rows_in_order(spaces, 4), nearest_rows(spaces, 4))
 
