@@ -23,7 +23,7 @@ from ..network import MGCANet
 from ..network.attention import ContextPositionAttention, MultiBranchFeedForward
 from ..network.consensus import GraphConsensus
 from ..network.eight_point import weighted_eight_point
-from ..network.graph import FAR, RING, AnnularConvolution, EdgeMaximum, GraphBlock
+from ..network.graph import FAR, MANY, RING, AnnularConvolution, EdgeMaximum, GraphBlock, along_variation
 from ..network.mgca_net import MINIMUM_CONSENSUS, Head, HeadOutput, Prior, better_half, match_count
 from ..network.order_aware import OrderAwareBlock, OrderAwareFilter
 from ..network.point_cn import (
@@ -37,22 +37,13 @@ from ..network.point_cn import (
 )
 
 ROOT_HALF = 0.5**0.5
-# Up to so many matches each is compared with all; of more, with so many around it. The networks were trained on 2000.
-MANY, WINDOW = 2048, 1024
 
 
 @torch.no_grad()
-def compact(network: MGCANet, windows: bool = False) -> MGCANet:
-    """Copy of a network in evaluation mode that says the same in fewer operations.
-
-    With ``windows`` it looks for neighbours in an order in which they lie near each other
-    (:func:`nearest_rows_in_order`).
-    """
+def compact(network: MGCANet) -> MGCANet:
+    """Copy of a network in evaluation mode that says the same in fewer operations."""
     copy = deepcopy(network).eval()
     _replace(copy)
-    for module in copy.modules():
-        if isinstance(module, (_GraphBlock, _GraphConsensus)):
-            module.nearest_rows = nearest_rows_in_order if windows else nearest_rows
     return copy
 
 
@@ -346,11 +337,10 @@ class _AttentionalFusion(nn.Module):
 
 
 class _GraphBlock(nn.Module):
-    nearest_rows: Callable[[Tensor, int], Tensor]
-
     def __init__(self, block: Any) -> None:
         super().__init__()
         self.k, self.fusion = block.k, _AttentionalFusion(block.fusion)
+        self.nearest_rows = nearest_rows_in_order if block.windows else nearest_rows
         self.annular, self.maximum = _AnnularConvolution(block.annular), _EdgeMaximum(block.maximum)
         self.reduce1, self.reduce2 = block.reduce1, block.reduce2
         if isinstance(block.reduce1, nn.Identity):
@@ -370,8 +360,6 @@ class _GraphBlock(nn.Module):
 class _GraphConsensus(nn.Module):
     """The reduced maps go without their biases: those move no neighbour, and are in the shift of the rings."""
 
-    nearest_rows: Callable[[Tensor, int], Tensor]
-
     def __init__(self, block: Any) -> None:
         super().__init__()
         self.k, self.graphs = block.k, len(block.reduce)
@@ -383,7 +371,7 @@ class _GraphConsensus(nn.Module):
     def forward(self, maps: Sequence[Tensor]) -> Tensor:
         reduced = torch.cat([reduce(x) for reduce, x in zip(self.reduce, maps)], -1)  # (B, N, graphs · C)
         graphs = reduced.view(*reduced.shape[:2], self.graphs, -1).transpose(1, 2)
-        rows = self.nearest_rows(graphs, self.k).transpose(1, 2)  # (B, N, graphs, k)
+        rows = nearest_rows(graphs, self.k).transpose(1, 2)  # (B, N, graphs, k)
         return self.output(self.annular(reduced, F.embedding(rows, graphs.reshape(-1, graphs.shape[-1]))))
 
 
@@ -398,15 +386,12 @@ def nearest_rows(features: Tensor, k: int) -> Tensor:
 def nearest_rows_in_order(features: Tensor, k: int) -> Tensor:
     """The same, looked for in an order in which nearest matches lie near each other, so that windows of it will do.
 
-    Of more than :data:`MANY` matches the order is that along the direction in which the features vary most, which one
-    step of the power method tells well enough: nearly all neighbours are in the window. Up to :data:`MANY` matches stay
-    where they are.
+    It is that of :func:`mgca_filter.network.graph.along_variation`; up to :data:`MANY` matches stay where they are.
     """
     *outer, count, channels = features.shape
     x = features - features.mean(-2, keepdim=True)
-    direction = x.transpose(-1, -2) @ (x @ torch.linspace(1.0, 2.0, channels).unsqueeze(-1))
     place = torch.arange(count)
-    along = torch.where(place[-1:] < MANY, -place.float(), (x @ direction)[..., 0])
+    along = torch.where(place[-1:] < MANY, -place.float(), along_variation(x))
     starts = _starts(outer, count)[..., 0]
     order = along.argsort(-1, descending=True) + starts
     nearest = order.flatten()[_rows_nearest(F.embedding(order, x.reshape(-1, channels)), k)]

@@ -103,9 +103,7 @@ def _prior_weights(prior: Prior) -> dict[str, object]:
 
 def export_onnx(network: MGCANet, path: str | Path, metadata: Mapping[str, str]) -> None:
     """Write the ONNX file: opset 17, dynamic batch and N, declared output shapes, metadata inside."""
-    # An order for each search is some twenty nodes: six of them are too many for a file that must open fast.
-    windows = network.config.stages == 1
-    contract = _Contract(compact(network, windows).cpu()).eval()
+    contract = _Contract(compact(network).cpu()).eval()
     example = torch.rand(2, 64, 4) - 0.5, torch.rand(2, 64, ATTRIBUTE_CHANNELS)
     dynamic = {name: {0: "B", 1: "N"} for name in (*INPUT_NAMES, "logits")} | {"essential": {0: "B"}}
     with warnings.catch_warnings():
@@ -124,7 +122,7 @@ def export_onnx(network: MGCANet, path: str | Path, metadata: Mapping[str, str])
     model = onnx.load(str(path))
     for axis in (1, 2):  # tracing loses the two fixed axes of the essential matrix
         model.graph.output[1].type.tensor_type.shape.dim[axis].dim_value = 3
-    model = simplify(model, windows)
+    model = simplify(model, windows=network.config.windows)
     onnx.helper.set_model_props(model, dict(metadata))
     onnx.checker.check_model(model, full_check=True)
     onnx.save(model, str(path))

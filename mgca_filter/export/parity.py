@@ -5,8 +5,7 @@ PyTorch is the reference; ONNX Runtime and OpenCV's DNN module are compared with
 Neighbours and the better half of the matches are chosen by comparison, so the network is not continuous: where two
 distances agree to seven digits, two runtimes choose differently, and the logits of some matches differ in the second
 digit. The last rows show what that means: PyTorch against itself, with every coordinate moved by one unit in the last
-place. Of a network of one stage PyTorch alone compares all of more than 2048 matches: their decisions agree, their
-logits not as nearly (``docs/runtime.md``, "Many matches").
+place.
 """
 
 from __future__ import annotations

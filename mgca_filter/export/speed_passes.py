@@ -15,11 +15,10 @@ import numpy as np
 import onnx
 from onnx import helper, numpy_helper
 
-from .compact_network import MANY, WINDOW
+from ..network.graph import BLOCK, MANY, WINDOW
 from .rolled_loops import roll_loops
 from .trial_graph import Size, TrialGraph, all_inputs, bodies, signature
 
-BLOCK = 256  # rows of a neighbour search at once: 32 MB with four graphs of 8000 matches
 _MAX_SIZES = 8  # elements of what may be the shape of a tensor
 
 

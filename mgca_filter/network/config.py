@@ -58,6 +58,15 @@ class NetworkConfig:
         if self.attention not in ("channel", "point"):
             raise ValueError(f"attention must be 'channel' or 'point', not {self.attention!r}")
 
+    @property
+    def windows(self) -> bool:
+        """Of many matches each is compared with those around it alone (:mod:`mgca_filter.network.graph`).
+
+        The order that this takes is some twenty nodes for each search in the exported graph: the six of three stages
+        are too many for a file that must open fast.
+        """
+        return self.stages == 1
+
     def to_json(self) -> str:
         """All fields as a JSON object."""
         return json.dumps(asdict(self))

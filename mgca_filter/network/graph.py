@@ -16,26 +16,53 @@ from .point_cn import ChannelBatchNorm, ContextNorm, LinearNorm, NormLinear
 
 RING = 3  # neighbours that one annular kernel covers
 FAR = 1e30
+# Up to so many matches each is compared with all others, the networks having been trained on 2000; of more, in windows,
+# with so many around its block of so many.
+MANY, WINDOW, BLOCK = 2048, 1024, 256
 
 
-def nearest_neighbours(features: Tensor, k: int) -> Tensor:
+def nearest_neighbours(features: Tensor, k: int, windows: bool = False) -> Tensor:
     """Indices (B, N, k) of the nearest matches in feature space (B, N, C), nearest first.
 
     The match itself is one of them. Where there are fewer than k matches the match itself fills the rest:
     k padding keys that are never near stand behind the real ones, so that k is a constant of the graph.
+
+    In ``windows`` each of more than :data:`MANY` matches is compared with :data:`WINDOW` others alone, and time grows
+    with N instead of N²: in the order of :func:`along_variation` a block of matches sees those around it, among which
+    nearly all neighbours are.
     """
     x = features.detach().float()
     x = x - x.mean(1, keepdim=True)  # distances survive, cancellation does not
-    count = x.shape[1]
-    # Per row i, the order of |x_i − x_j|² is that of |x_j|²/2 − x_i·x_j.
-    penalty = F.pad(0.5 * x.square().sum(-1, keepdim=True), (0, 0, 0, k), value=FAR)
-    keys = torch.cat([F.pad(x, (0, 0, 0, k)), -penalty], -1)  # (B, N + k, C + 1)
-    queries = torch.cat([x, torch.ones_like(x[..., :1])], -1)
     with torch.autocast(x.device.type, enabled=False):  # neighbours must not depend on the training precision
-        nearness = queries @ keys.transpose(1, 2)  # (B, N, N + k)
-    indices = nearness.topk(k, dim=-1).indices
-    own = torch.arange(count, device=x.device).view(1, -1, 1)
-    return torch.where(indices < count, indices, own)
+        if not windows or x.shape[1] <= MANY:
+            return _nearest(x, x, k)
+        order = along_variation(x).argsort(-1, descending=True)  # (B, N)
+        ordered, found = gather_rows(x, order), []
+        for first in range(0, x.shape[1], BLOCK):
+            start = min(max(first - (WINDOW - BLOCK) // 2, 0), x.shape[1] - WINDOW)
+            found.append(_nearest(ordered[:, first : first + BLOCK], ordered[:, start : start + WINDOW], k) + start)
+        nearest = order.unsqueeze(-1).expand(-1, -1, k).gather(1, torch.cat(found, 1))
+        return nearest.gather(1, order.argsort(-1).unsqueeze(-1).expand(-1, -1, k))
+
+
+def _nearest(x: Tensor, others: Tensor, k: int) -> Tensor:
+    """Numbers (B, N, k) of the nearest rows of ``others`` (B, M, C) to each row of x (B, N, C); its own for none."""
+    # Per row i, the order of |x_i − x_j|² is that of |x_j|²/2 − x_i·x_j.
+    penalty = F.pad(0.5 * others.square().sum(-1, keepdim=True), (0, 0, 0, k), value=FAR)
+    keys = torch.cat([F.pad(others, (0, 0, 0, k)), -penalty], -1)  # (B, M + k, C + 1)
+    queries = torch.cat([x, torch.ones_like(x[..., :1])], -1)
+    indices = (queries @ keys.transpose(1, 2)).topk(k, dim=-1).indices  # of (B, N, M + k)
+    own = torch.arange(x.shape[1], device=x.device).view(1, -1, 1)
+    return torch.where(indices < others.shape[1], indices, own)
+
+
+def along_variation(x: Tensor) -> Tensor:
+    """Where centred features (..., N, C) lie, (..., N), along the direction in which they vary most, roughly.
+
+    One step of the power method, from a start that stands for no direction in particular.
+    """
+    start = torch.linspace(1.0, 2.0, x.shape[-1], device=x.device).unsqueeze(-1)
+    return (x @ (x.transpose(-1, -2) @ (x @ start)))[..., 0]
 
 
 def batch_rows(indices: Tensor, count: int) -> Tensor:
@@ -146,9 +173,9 @@ class GraphBlock(nn.Module):
     Both branches are ``expansion`` C wide (2 in the published code) and reduced to C before the fusion.
     """
 
-    def __init__(self, channels: int, k: int, expansion: int = 1) -> None:
+    def __init__(self, channels: int, k: int, expansion: int = 1, windows: bool = False) -> None:
         super().__init__()
-        self.k = k
+        self.k, self.windows = k, windows
         width = expansion * channels
         self.annular = AnnularConvolution(channels, width, graphs=1, k=k)
         self.maximum = EdgeMaximum(channels, width)
@@ -157,6 +184,6 @@ class GraphBlock(nn.Module):
         self.fusion = AttentionalFusion(channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        indices = nearest_neighbours(x, self.k)  # (B, N, k)
+        indices = nearest_neighbours(x, self.k, self.windows)  # (B, N, k)
         annular = self.reduce1(self.annular([x], [indices]))
         return self.fusion(annular, self.reduce2(self.maximum(x, indices)))

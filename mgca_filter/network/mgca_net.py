@@ -116,7 +116,7 @@ class Stage(nn.Module):
         self.point_cn1 = PointCN(c)
         self.attention1 = self._attention(config)
         self.point_cn2 = nn.Sequential(PointCN(c), PointCN(c))
-        self.graph = GraphBlock(c, config.neighbours, config.graph_expansion)
+        self.graph = GraphBlock(c, config.neighbours, config.graph_expansion, config.windows)
         self.order_aware = OrderAwareBlock(c, config.clusters)
         self.order_fuse = PointCN(2 * c, c)
         self.point_cn3 = PointCN(c)

@@ -273,8 +273,7 @@ def test_the_shipped_network_exports_as_small_and_says_the_same(tmp_path: Path) 
             assert row.passed, parity.format_parity([row])
 
 
-def test_the_fast_network_decides_on_many_matches_as_if_it_had_compared_all() -> None:
+def test_the_fast_network_compares_many_matches_as_torch_does() -> None:
     path = mgca_filter.model_path("fast")
     row = parity.compare(open_backend(path, "onnxruntime"), open_backend(path, "torch"), 5000)
-    assert row.flipped <= row.matches // 1000
-    assert row.essential_difference < parity.ESSENTIAL_TOLERANCE
+    assert row.passed, parity.format_parity([row])

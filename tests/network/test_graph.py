@@ -9,6 +9,7 @@ from networks import randomise_norms
 from torch import Tensor
 from torch.nn import functional as F
 
+from mgca_filter.network import graph
 from mgca_filter.network.graph import (
     AnnularConvolution,
     AttentionalFusion,
@@ -43,6 +44,31 @@ def test_neighbours_are_those_of_a_sort(count, k):
     indices = nearest_neighbours(x, k)
     np.testing.assert_array_equal(indices.numpy(), brute_force_neighbours(x, k))
     np.testing.assert_array_equal(indices[..., 0].numpy(), np.tile(np.arange(count), (2, 1)))
+
+
+@pytest.mark.parametrize("count", [40, 41, 100])
+def test_neighbours_in_windows_are_the_nearest_in_reach(monkeypatch, count):
+    monkeypatch.setattr(graph, "MANY", 40)
+    monkeypatch.setattr(graph, "WINDOW", 24)
+    monkeypatch.setattr(graph, "BLOCK", 8)
+    x = features(count, seed=count)
+    exact, windowed = nearest_neighbours(x, 3), nearest_neighbours(x, 3, windows=True)
+    assert torch.equal(exact, windowed) == (count <= 40)
+    assert torch.equal(windowed[..., 0], torch.arange(count).expand(2, -1))  # itself
+    if count > 40:
+        order = graph.along_variation(x - x.mean(1, keepdim=True)).argsort(-1, descending=True)
+        for pair, found, places in zip(x, windowed, order):
+            for rank, row in enumerate(places.tolist()):
+                start = min(max(rank // 8 * 8 - 8, 0), count - 24)
+                reach = places[start : start + 24]
+                distance = (pair[reach] - pair[row]).square().sum(-1)
+                torch.testing.assert_close(found[row], reach[distance.argsort()[:3]])
+
+
+def test_neighbours_lie_where_features_vary_together():
+    x = features(4000, 8) * torch.tensor([6.0, 1, 1, 1, 1, 1, 1, 1])
+    exact, windowed = nearest_neighbours(x, 3), nearest_neighbours(x, 3, windows=True)
+    assert (exact.unsqueeze(-1) == windowed.unsqueeze(-2)).any(-1).float().mean() > 0.95
 
 
 def test_neighbours_survive_a_large_common_offset():
