@@ -22,7 +22,7 @@ struct FullPrecision {
 };
 constexpr std::array<FullPrecision, 2> kFullPrecision{{{"CUDAExecutionProvider", "use_tf32", "0"},
                                                        {"TensorrtExecutionProvider", "trt_fp16_enable", "0"}}};
-// Ends the process while it reads the graph's loops.
+// Does not find what the graph's loops take from outside them; by itself OpenVINO does: docs/how_to/runtimes.md.
 constexpr const char* kRefused = "OpenVINOExecutionProvider";
 constexpr std::array<const char*, 2> kInputNames{"correspondences", "attributes"};
 constexpr std::array<const char*, 2> kOutputNames{"logits", "essential"};

@@ -1,7 +1,8 @@
 """Do all runtimes say the same? ``python -m mgca_filter.export.parity [MODEL.onnx] [--bundles FOLDER]``.
 
-PyTorch is the reference; ONNX Runtime and OpenCV's DNN module are compared with it, each where it is installed. With
-``--reference OTHER.onnx`` it is another file in ONNX Runtime: an export before this one, say.
+PyTorch is the reference; ONNX Runtime, OpenCV's DNN module and OpenVINO (``pip install openvino``) are compared with
+it, each where it is installed. With ``--reference OTHER.onnx`` it is another file in ONNX Runtime: an export before
+this one, say.
 Neighbours and the better half of the matches are chosen by comparison, so the network is not continuous: where two
 distances agree to seven digits, two runtimes choose differently, and the logits of some matches differ in the second
 digit. The last rows show what that means: PyTorch against itself, with every coordinate moved by one unit in the last
@@ -148,6 +149,28 @@ def _figures(row: ParityRow) -> str:
     return f"{row.logit_difference:.1e} | {row.quantile_90:.1e} | {different} | {row.flipped}"
 
 
+class OpenVinoRuntime:
+    """The ONNX file in OpenVINO, one pair at a time in full precision on the CPU; ImportError where it is missing.
+
+    Why one pair, and why told the precision: ``docs/how_to/runtimes.md``.
+    """
+
+    name = "openvino"
+
+    def __init__(self, path: Path) -> None:
+        import openvino
+
+        self.metadata = open_backend(path, "onnxruntime").metadata
+        model = openvino.Core().read_model(path)
+        model.reshape({"correspondences": [1, -1, 4], "attributes": [1, -1, 8]})
+        self._model = openvino.Core().compile_model(model, "CPU", {"INFERENCE_PRECISION_HINT": "f32"})
+
+    def infer(self, correspondences: Float32Array, attributes: Float32Array) -> Inputs:
+        """One forward pass, as of the package's backends."""
+        outputs = self._model({"correspondences": correspondences, "attributes": attributes})
+        return np.array(outputs["logits"]), np.array(outputs["essential"])
+
+
 class MovedByAnUlp:
     """A backend whose input is moved by one unit in the last place, each coordinate up or down at random."""
 
@@ -169,6 +192,10 @@ def open_runtimes(path: Path) -> list[Backend]:
             runtimes.append(open_backend(path, name))
         except BackendError as error:
             print(f"without {name}: {error}", file=sys.stderr)
+    try:
+        runtimes.append(OpenVinoRuntime(path))
+    except ImportError as error:
+        print(f"without openvino: {error}", file=sys.stderr)
     return runtimes
 
 

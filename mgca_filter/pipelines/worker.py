@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from typing import Any
 
 import cv2
@@ -27,6 +27,7 @@ from ..features import (
 )
 from ..geometry.orientation import UPRIGHT
 from ..images import decode_photo
+from ..inputs.attributes import MatchAttributes
 from ..inputs.pair import MatchPair
 from ..match_filter import MatchFilter
 from ..result import EXPLAINED, FilterResult, Status
@@ -149,12 +150,18 @@ class PairWorker:
         )
         filtered = there and matches is not None and _one_to_one(pairs)
 
+        @cache
+        def told_by_descriptors() -> MatchAttributes:  # only the network asks
+            return attributes_of_matches(image1, image2, pairs)
+
         def answer(pair: MatchPair) -> FilterResult:
             quick = self._filter if pair.K1 is not None else self._uncalibrated
             result = quick.filter_list(pair) if filtered else None
-            if result is None and there and matches is not None:  # only the network asks what the descriptors tell
-                pair = replace(pair, attributes=attributes_of_matches(image1, image2, pairs))
-            return self._filter.filter_many([pair])[0] if result is None else result
+            if result is not None:
+                return result
+            if there and matches is not None:
+                pair = replace(pair, attributes=told_by_descriptors())
+            return self._filter.filter_many([pair])[0]
 
         if image1.K is not None and image2.K is not None:
             result = answer(replace(pair, K1=image1.K, K2=image2.K, stretch1=image1.stretch, stretch2=image2.stretch))
